@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 from numba import config, njit
 
 from zlocus.core.errors import ZlocusWarning
+from zlocus.core.lazy_kernels import KernelFiles, LazyKernel
 
 F = TypeVar("F", bound=Callable[..., Any])
 # A disk with less room than this takes no new folder of compiled kernels; all kernels together take 12 MB.
@@ -23,7 +24,10 @@ MIN_FREE_BYTES = 50_000_000
 COMPLETE = "complete"
 # Files of the package whose content compiled kernels depend on: Numba looks at a kernel's own file alone, but a kernel
 # contains the code of the kernels that it calls and the values of the constants that it uses.
-KERNEL_FILES = ("core/jit.py", "*/kernels/*.py", "products/shade_kernel.py", "sensors/*_kernel.py", "synthetic/*.py")
+KERNEL_FILES = (
+    "core/jit.py", "core/lazy_kernels.py", "*/kernels/*.py", "products/shade_kernel.py", "sensors/*_kernel.py",
+    "synthetic/*.py",
+)  # fmt: skip
 
 
 def cache_folder(package: Path) -> Path | None:
@@ -133,5 +137,13 @@ CACHE = KernelCache(Path(__file__).parents[1])
 
 def kernel(function: F) -> F:
     """Decorate a kernel: compiled on first use, cached on disk, releases the GIL, IEEE arithmetic."""
+    return cast(F, function if config.DISABLE_JIT else LazyKernel(function, _dispatcher))  # type: ignore[attr-defined]
+
+
+def _dispatcher(function: Callable[..., Any]) -> Any:
+    """What Numba makes of a kernel, with its cache on disk where one can be kept."""
+    dispatcher: Any = njit(nogil=True, error_model="numpy")(function)
     with CACHE.in_use() as is_kept:
-        return cast(F, njit(cache=is_kept, nogil=True, error_model="numpy")(function))
+        if is_kept:
+            dispatcher._cache = KernelFiles(function)
+    return dispatcher

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,13 @@ def utc_now() -> str:
 
 def versions_record() -> dict[str, str]:
     """Versions of Python and of the libraries on which heights may depend."""
-    return {"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}}
+    return {"python": sys.version.split()[0], **{name: _version(name) for name in LIBRARIES}}
+
+
+@cache
+def _version(name: str) -> str:
+    """Version of an installed package. It is kept, because a run asks several times, and each takes a millisecond."""
+    return version(name)
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:

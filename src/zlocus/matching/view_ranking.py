@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 IntArray = NDArray[np.int64]
 # Cells whose feature points are looked up together, to limit the memory.
 CELLS_PER_LOOKUP = 20000
+# For this many cells the distances to all feature points are computed sooner than a tree of the points is built.
+FEW_CELLS = 16
 # Between images of equal accumulated labels the labels at so many nearest feature points decide: as digits of base 3
 # they fit into 64 bits.
 POINTS_FOR_EQUAL_IMAGES = 40
@@ -111,16 +114,11 @@ def _ordered(
     neighbours: Neighbours, labels: NDArray[np.int8], of_scene: IntArray, options: SelectionOptions
 ) -> ImageOrder:
     """Order of the images at cells with these neighbours. of_scene : (i,) int64, see `scene_labels`."""
-    # SciPy takes a third of a second to import, which scenes whose views are all used do not have to spend.
-    from scipy.sparse import csr_array
-
-    n_cells, counts = len(neighbours.start) - 1, np.diff(neighbours.start)
-    shape = (n_cells, len(labels))
-    position = np.arange(len(neighbours.index)) - np.repeat(neighbours.start[:-1], counts)
+    position = np.arange(len(neighbours.index)) - np.repeat(neighbours.start[:-1], np.diff(neighbours.start))
     exponent = np.maximum(POINTS_FOR_EQUAL_IMAGES - 1 - position, 0)
     digit = np.where(position < POINTS_FOR_EQUAL_IMAGES, 3**exponent, 0).astype(np.int64)
     accumulated, by_nearest = (
-        np.asarray(csr_array((factor, neighbours.index, neighbours.start), shape=shape) @ values, np.int64)
+        _sums(neighbours, factor, values)
         for factor, values in (
             (np.ones_like(digit), _label_values(labels, options)),
             (digit, labels.astype(np.int64)),
@@ -130,6 +128,15 @@ def _ordered(
     last = np.broadcast_to(-of_scene, accumulated.shape)
     images = np.lexsort((last, -by_nearest, -accumulated), axis=-1)
     return ImageOrder(images.astype(np.int64), accumulated, neighbours.order_source)
+
+
+def _sums(neighbours: Neighbours, factor: IntArray, values: IntArray) -> IntArray:
+    """Sums over the neighbours of each cell, (c, i) int64. factor : (p,), of each neighbour; values : (n, i)."""
+    sums = np.zeros((len(neighbours.start) - 1, values.shape[1]), np.int64)
+    for column, into in zip(values.T, sums.T, strict=True):
+        until = np.concatenate([[0], np.cumsum(factor * column[neighbours.index])])
+        into[:] = until[neighbours.start[1:]] - until[neighbours.start[:-1]]
+    return sums
 
 
 class NeighbourSearch:
@@ -142,13 +149,10 @@ class NeighbourSearch:
 
     def __init__(self, xy: FloatArray, options: SelectionOptions) -> None:
         """xy : (n, 2) float64 px, any number of feature points."""
-        from scipy.spatial import cKDTree
-
         # Map coordinates are large and triangulation squares them, so they are counted from their mean.
         self.centre = xy.mean(axis=0) if len(xy) else np.zeros(2)
         self.xy = xy - self.centre
         self.options = options
-        self.tree = cKDTree(self.xy)
         self.triangles = triangulated(self.xy) if options.neighbours == "tin" else None
 
     def of(self, cell_xy: FloatArray) -> Neighbours:
@@ -159,14 +163,14 @@ class NeighbourSearch:
             return Neighbours(np.zeros(0, np.int64), np.zeros(len(cell_xy) + 1, np.int64), of_scene)
         radius, n_nearest = self.options.radius_px, self.options.nearest
         # Infinite where there are fewer points.
-        distance = np.asarray(self.tree.query(cell_xy, k=list(range(1, n_nearest + 1)))[0], np.float64)
+        distance = self._nearest_distances(cell_xy, n_nearest)
         simplex = np.full(len(cell_xy), -1) if self.triangles is None else self.triangles.find_simplex(cell_xy)
         is_close = simplex >= 0 if self.options.neighbours == "tin" else distance[:, 0] <= radius * (1 + ROUNDING)
         max_distance = self.options.max_radii * radius
         is_near = distance[:, 0] <= max_distance * (1 + ROUNDING)
         source = np.where(is_close, OrderSource.NEIGHBOURS, np.where(is_near, OrderSource.NEAREST, OrderSource.SCENE))
         reach = np.where(is_close, radius, np.minimum(distance[:, -1], max_distance))
-        cells, index = _within(self.tree, cell_xy, np.flatnonzero(simplex < 0), reach)
+        cells, index = self._within(cell_xy, np.flatnonzero(simplex < 0), reach * (1 + ROUNDING))
         if self.triangles is not None:
             held = np.flatnonzero(simplex >= 0)
             cells = np.concatenate([cells, np.repeat(held, 3)])
@@ -175,6 +179,39 @@ class NeighbourSearch:
         by_distance = np.lexsort((index, np.hypot(offset[:, 0], offset[:, 1]), cells))
         start = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=len(cell_xy)))])
         return Neighbours(index[by_distance].astype(np.int64), start.astype(np.int64), source.astype(np.uint8))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Tree of the feature points."""
+        # SciPy takes a third of a second to import, which runs that look up a few cells only do not have to spend.
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.xy)
+
+    def _nearest_distances(self, cell_xy: FloatArray, count: int) -> FloatArray:
+        """Distances (c, count) of the nearest feature points; infinite where there are fewer points."""
+        if len(cell_xy) > FEW_CELLS:
+            return np.asarray(self.tree.query(cell_xy, k=list(range(1, count + 1)))[0], np.float64)
+        nearest = np.full((len(cell_xy), count), np.inf)
+        found = np.sort(_distances(cell_xy, self.xy), axis=1)[:, :count]
+        nearest[:, : found.shape[1]] = found
+        return nearest
+
+    def _within(self, cell_xy: FloatArray, cells: IntArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
+        """Pairs of a cell and a feature point within the cell's reach, each (p,) int64. reach : (c,)."""
+        if len(cell_xy) <= FEW_CELLS:
+            rows, index = np.nonzero(_distances(cell_xy[cells], self.xy) <= reach[cells, None])
+            return cells[rows], index
+        balls = self.tree.query_ball_point(cell_xy[cells], reach[cells])
+        counts = np.fromiter(map(len, balls), np.int64, len(cells))
+        index = np.fromiter(chain.from_iterable(balls), np.int64, int(counts.sum()))
+        return np.repeat(cells, counts), index
+
+
+def _distances(places: FloatArray, points: FloatArray) -> FloatArray:
+    """Distances (m, n) from places (m, 2) to points (n, 2)."""
+    offset = places[:, None] - points
+    return np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
 
 
 def triangulated(xy: FloatArray) -> Delaunay | None:
@@ -187,14 +224,6 @@ def triangulated(xy: FloatArray) -> Delaunay | None:
         return Delaunay(xy)
     except QhullError:
         return None
-
-
-def _within(tree: cKDTree, xy: FloatArray, cells: IntArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs of a cell and a point of the tree within the cell's reach, each (p,) int64."""
-    balls = tree.query_ball_point(xy[cells], reach[cells] * (1 + ROUNDING))
-    counts = np.fromiter(map(len, balls), np.int64, len(cells))
-    index = np.fromiter(chain.from_iterable(balls), np.int64, int(counts.sum()))
-    return np.repeat(cells, counts), index
 
 
 @dataclass(frozen=True)

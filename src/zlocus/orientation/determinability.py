@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from zlocus.core.sensor_model import FloatArray, SensorModel, Stationed
 from zlocus.orientation.parameter_groups import POSE, POSE_NAMES, ParameterGroup
@@ -142,6 +141,8 @@ def undetermined_parameters(
 def covariance_from(information: FloatArray, deviation: FloatArray) -> FloatArray:
     """Covariance matrix (p, p) of parameters from information (p, p) and standard deviations beforehand (p,), which may
     be 0: (N + S^-2)^-1 = S (S N S + 1)^-1 S."""
+    from scipy import linalg
+
     scaled = deviation[:, None] * information * deviation + np.eye(len(deviation))
     return np.asarray(deviation[:, None] * linalg.inv(scaled) * deviation)
 

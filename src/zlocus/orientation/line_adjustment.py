@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray, Scanning, bare
@@ -40,11 +39,12 @@ SMALLEST_DETERMINANT = 1e-9
 
 @dataclass(frozen=True)
 class _Process:
-    """A Gaussian process at the nodes of an image: its inverse covariance (k, k), and the logarithm of the latter's
-    determinant."""
+    """A Gaussian process at the nodes of an image: its inverse covariance (k, k), the logarithm of the latter's
+    determinant, and the sum of the variances at all nodes."""
 
     precision: FloatArray
     log_determinant: float
+    total_variance: float
 
 
 def estimated_line_shifts(views: Sequence[View], adjustment: Adjustment) -> tuple[LineShifts | None, ...]:
@@ -149,6 +149,9 @@ class _Estimator:
                 self.chosen[axis] = _likeliest(normal, pull)
             process = self.chosen[axis]
             if process is not None:
+                # SciPy's linear algebra takes a quarter of a second to import. Most runs do not come here.
+                from scipy.linalg import cho_factor, cho_solve
+
                 self.shift[:, axis] = cho_solve(cho_factor(normal + process.precision), pull)
 
     def at_ties(self) -> FloatArray:
@@ -167,9 +170,13 @@ def _likeliest(normal: FloatArray, pull: FloatArray) -> _Process | None:
     """
     best, best_odds = None, MIN_LOG_ODDS
     for process in _processes(len(pull)):
-        factor = cho_factor(normal + process.precision)
-        log_determinant = 2.0 * np.log(np.diag(factor[0])).sum()
-        odds = 0.5 * (process.log_determinant - log_determinant + pull @ cho_solve(factor, pull))
+        # With the pull p as one more row and column, the last row of the Cholesky factor L of N holds L^-1 p, the
+        # square of which is p^T N^-1 p. The last element is larger than that, so that the matrix is positive definite.
+        last = 1.0 + process.total_variance * (pull @ pull)
+        bordered = np.block([[normal + process.precision, pull[:, None]], [pull, last]])
+        factor = np.linalg.cholesky(bordered)
+        log_determinant = 2.0 * np.log(np.diag(factor)[:-1]).sum()
+        odds = 0.5 * (process.log_determinant - log_determinant + factor[-1, :-1] @ factor[-1, :-1])
         if odds > best_odds:
             best, best_odds = process, odds
     return best
@@ -182,8 +189,11 @@ def _processes(n_nodes: int) -> list[_Process]:
     for length in LENGTHS_NODES:
         correlation = np.exp(-0.5 * ((node[:, None] - node) / length) ** 2) + WHITE_SHARE * np.eye(n_nodes)
         inverse = np.asarray(np.linalg.inv(correlation), float)
-        log_determinant = -float(np.linalg.slogdet(correlation)[1])
+        log_determinant, trace = -float(np.linalg.slogdet(correlation)[1]), float(np.trace(correlation))
         found += [
-            _Process(inverse / sigma**2, log_determinant - 2.0 * n_nodes * float(np.log(sigma))) for sigma in SIGMAS_PX
-        ]
+            _Process(
+                inverse / sigma**2, log_determinant - 2.0 * n_nodes * float(np.log(sigma)), trace * sigma**2
+            )
+            for sigma in SIGMAS_PX
+        ]  # fmt: skip
     return found

@@ -16,7 +16,6 @@ from zlocus.orientation.corrections import CameraSolver, excluded_images_of, wit
 from zlocus.orientation.line_adjustment import estimated_line_shifts, no_line_shifts, without_line_shifts
 from zlocus.orientation.parameter_groups import needs_bundle_adjustment
 from zlocus.orientation.plausibility import Doubt, ExcludedImage, doubts_about
-from zlocus.orientation.self_calibration import check_self_calibration
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_points import first_ground_points, with_rough_ties
 from zlocus.orientation.tie_refinement import RefinedTies, refine_ties
@@ -183,6 +182,8 @@ def orient(
     request = OrientationRequest() if request is None else request
     options = _with_model(options, scene)
     if options.model == "joint":
+        from zlocus.orientation.self_calibration import check_self_calibration
+
         check_self_calibration(scene.views, options)
     refined = request.refined_ties
     if refined is None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from zlocus.core.progress import Progress
 from zlocus.io.grid_inputs import lacks_vertical_datum
-from zlocus.orientation.determinability import images_in_words
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.plausibility import Doubt
 
@@ -49,6 +48,8 @@ def self_calibration_sentences(orientation: Orientation) -> list[str]:
     bundle_adjustment = orientation.bundle_adjustment
     if bundle_adjustment is None:
         return []
+    from zlocus.orientation.determinability import images_in_words
+
     names = [view.name for view in orientation.views]
     corrections: dict[tuple[int, ...], list[str]] = {}
     for each in bundle_adjustment.calibration:

@@ -1,8 +1,12 @@
-"""What makes the tiles of a surface: their matching on the ground grid, or heights of pixels matched before."""
+"""What makes the tiles of a surface: their matching on the ground grid, or heights of pixels matched before.
+
+Modules of image space are imported where they are used: most runs match on the ground grid, and start sooner.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DsmRequest
@@ -10,18 +14,12 @@ from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import Tile
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
-from zlocus.pipeline.image_scenes import GroundArea, ImageSetup, reference_scene
-from zlocus.pipeline.image_tiles import (
-    GridImages,
-    ImageMatching,
-    grid_tile,
-    heights_for_grid,
-    match_images,
-    pixel_heights,
-)
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup, supported_views
 from zlocus.pipeline.tile_run import Tally, TileJob, TileProduct
+
+if TYPE_CHECKING:
+    from zlocus.pipeline.image_tiles import GridImages, ImageMatching
 
 
 def tile_maker(
@@ -40,6 +38,9 @@ def tile_maker(
     """
     if not request.is_in_image_space:
         return tile_job
+    from zlocus.pipeline.image_scenes import GroundArea
+    from zlocus.pipeline.image_tiles import ImageMatching, grid_tile
+
     grid, match_scene = tile_job.grid, setup.match_scene
     box, margin = grid.geobox.extent.boundingbox, tile_job.config.pyramid.halo * grid.cell_m
     bounds = (box.left - margin, box.bottom - margin, box.right + margin, box.top + margin)
@@ -69,6 +70,9 @@ def tile_maker(
 
 def heights_of_images(request: DsmRequest, setup: RunSetup, matching: ImageMatching, progress: Progress) -> GridImages:
     """Heights of the pixels of all images, checked against each other."""
+    from zlocus.pipeline.image_scenes import ImageSetup
+    from zlocus.pipeline.image_tiles import heights_for_grid
+
     orientation = setup.orientation
     used = supported_views(setup.scene, orientation)
     is_supported = supported(orientation.xyz, orientation.sigma_z_m)
@@ -82,6 +86,9 @@ def heights_of_reference(setup: RunSetup, matching: ImageMatching, progress: Pro
 
     No other image is matched, so none can contradict them.
     """
+    from zlocus.pipeline.image_scenes import reference_scene
+    from zlocus.pipeline.image_tiles import GridImages, match_images, pixel_heights
+
     assert matching.ground_area is not None, "a surface has an area"
     assert matching.ground_area.z_range is not None, "between two heights"
     (matched,) = match_images([reference_scene(setup, matching.config)], matching, progress)

@@ -24,14 +24,11 @@ from zlocus.matching.fill import filled, filled_from
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.quality import Quality
-from zlocus.matching.selected_surface import match_tile_of_paper
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
-from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.event_log import NAME, EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most
-from zlocus.pipeline.execution.processes import Processes
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup, reference_features
@@ -259,10 +256,14 @@ def workers_for(plan: Plan, make: Callable[[Tile], TileProduct], progress: Progr
         See `Cluster`.
     """
     if plan.scheduler is not None:
+        from zlocus.pipeline.execution.cluster import Cluster
+
         cluster = Cluster(make, plan.scheduler)
         progress.note(f"Dask cluster at {plan.scheduler}; what it does is shown at {cluster.dashboard}")
         return cluster
     if plan.processes:
+        from zlocus.pipeline.execution.processes import Processes
+
         keep_at_most(0)  # the workers read the images from here on
         return Processes(make, plan.slots)
     return nullcontext(Here(make))
@@ -370,6 +371,8 @@ class MatchMethod:
         if self.selection != "paper":
             is_guided = self.selection == "guided"
             return match_tile(match_scene, tile.core_window, config, self.name, is_guided, fill, self.preselect)
+        from zlocus.matching.selected_surface import match_tile_of_paper
+
         if fill == "none":
             return match_tile_of_paper(match_scene, tile.core_window, tile.kept_window, config)
         # The cells around those that are kept fill gaps at their border.

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rasterio import DatasetReader
+from rasterio.warp import transform_geom
 
 from zlocus.core.scene import is_local
 from zlocus.io.atomic_write import write_atomically
@@ -20,6 +21,7 @@ from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
 from zlocus.io.run_record import read_record
 
+STAC_VERSION, WGS84 = "1.1.0", "EPSG:4326"
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
 HTML, GEOJSON = "text/html", "application/geo+json"
@@ -83,9 +85,6 @@ def write_item(folder: Path) -> bool:
     OutputError
         The file cannot be written.
     """
-    # The import takes a fifth of a second, which commands that write no item are spared.
-    import pystac
-
     with BandReader(folder / "dsm.tif") as reader:
         crs, cell_m, height_description = reader.crs, reader.cell_m, reader.description
     if crs is None or is_local(crs):
@@ -93,27 +92,33 @@ def write_item(folder: Path) -> bool:
     with open_raster(folder / "dsm.tif", "raster") as file:
         footprint = footprint_of(file)
     times = _times(folder)
-    item = pystac.Item(
-        id=folder.resolve().name or "surface",
-        geometry=footprint.geometry,
-        bbox=footprint.bbox,
-        datetime=times.single,
-        start_datetime=times.first,
-        end_datetime=times.last,
-        properties={
-            "title": "Digital surface model", "description": times.description, "gsd": cell_m,
-            "created": _rfc3339(times.created), "zlocus:crs": crs_label(crs), "zlocus:heights": height_description,
+    properties = {
+        "title": "Digital surface model", "description": times.description, "gsd": cell_m,
+        "created": _rfc3339(times.created), "zlocus:crs": crs_label(crs), "zlocus:heights": height_description,
+    }  # fmt: skip
+    ends = {"start_datetime": times.first, "end_datetime": times.last}
+    properties |= {name: _rfc3339(end) for name, end in ends.items() if end is not None}
+    item = {
+        "type": "Feature", "stac_version": STAC_VERSION, "stac_extensions": [],
+        "id": folder.resolve().name or "surface", "geometry": footprint.geometry, "bbox": footprint.bbox,
+        "properties": properties | {"datetime": None if times.single is None else _rfc3339(times.single)},
+        "links": [],
+        "assets": {
+            product.name.replace(".", "-"): asset_of(folder, product)
+            for product in PRODUCTS
+            if (folder / product.name).is_file()
         },
-    )  # fmt: skip
-    for product in PRODUCTS:
-        if (path := folder / product.name).is_file():
-            extra = {"bands": bands_of(path)} if product.media == COG else {}
-            asset = pystac.Asset(f"./{product.name}", product.title, None, product.media, list(product.roles), extra)
-            item.add_asset(product.name.replace(".", "-"), asset)
-    record = item.to_dict(include_self_link=False, transform_hrefs=False)
-    text = json.dumps(record, indent=2, allow_nan=False) + "\n"
+    }  # fmt: skip
+    text = json.dumps(item, indent=2, allow_nan=False) + "\n"
     write_atomically(folder / "item.json", lambda part: part.write_text(text, encoding="utf-8"))
     return True
+
+
+def asset_of(folder: Path, product: Product) -> dict[str, Any]:
+    """The entry of a product that is in the folder."""
+    bands = {"bands": bands_of(folder / product.name)} if product.media == COG else {}
+    named = {"href": f"./{product.name}", "type": product.media, "title": product.title}
+    return named | bands | {"roles": list(product.roles)}
 
 
 def footprint_of(file: DatasetReader) -> GridFootprint:
@@ -122,9 +127,12 @@ def footprint_of(file: DatasetReader) -> GridFootprint:
     An outline that crosses the date line is cut in two, and its west is larger than its east. Source: RFC 7946, 3.1.6,
     3.1.9 and 5.2.
     """
-    from rio_stac.stac import get_dataset_geom
-
-    geometry = get_dataset_geom(file, densify_pts=PIECES_PER_SIDE, precision=DEGREE_DECIMALS)["footprint"]
+    west, south, east, north = file.bounds
+    corners = np.array([(west, south), (east, south), (east, north), (west, north), (west, south)])
+    places = np.arange(PIECES_PER_SIDE * (len(corners) - 1) + 1)
+    x, y = (np.interp(places, places[::PIECES_PER_SIDE], column) for column in corners.T)
+    outline = {"type": "Polygon", "coordinates": [list(zip(x, y, strict=True))]}
+    geometry = transform_geom(file.crs, WGS84, outline, precision=DEGREE_DECIMALS)
     parts = geometry["coordinates"] if geometry["type"] == "MultiPolygon" else [geometry["coordinates"]]
     low, high = (np.array([end(part[0], axis=0) for part in parts]) for end in (np.min, np.max))
     # The eastern hemisphere's part has the larger longitudes, and the box begins in it.
@@ -135,7 +143,7 @@ def footprint_of(file: DatasetReader) -> GridFootprint:
 def bands_of(path: Path) -> list[dict[str, Any]]:
     """What the bands of a raster hold, as STAC's common metadata: names, data types, units and statistics.
 
-    The statistics are those that the file keeps of all its cells. (rio-stac computes them anew, from a reduced copy.)
+    The statistics are those that the file keeps of all its cells.
     """
     with open_raster(path, "raster") as file:
         bands = []

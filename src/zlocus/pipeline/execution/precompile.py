@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,6 @@ from zlocus.core.scene import ImageWindow, View
 from zlocus.core.sensor_model import FloatArray
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.radiometry import GreyScale
-from zlocus.pipeline.execution.processes import kernel_cache
 
 GROUPS = ("orient", "match", "refine")
 FOR_ANOTHER = (
@@ -53,6 +51,8 @@ def kernels_compiling(progress: Progress | None = None) -> Iterator[None]:
     if CACHE.is_complete or CACHE.folder is None:
         yield
         return
+    from zlocus.pipeline.execution.processes import kernel_cache
+
     progress, running = progress or SilentProgress(), []
     seconds = COMPILING_CPU_S / min(cores(), len(GROUPS))
     progress.note(
@@ -156,6 +156,8 @@ def warm(group: str) -> None:
 
     The last two take about as long, where `match` finds what `refine` has compiled already.
     """
+    from unittest.mock import patch
+
     from zlocus.matching import tile
     from zlocus.matching.kernels.shared_records import VisibleHeights
     from zlocus.matching.kernels.spline import spline_coefficients

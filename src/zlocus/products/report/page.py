@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -15,17 +15,19 @@ from pyproj import CRS, Transformer
 from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.evaluation.comparison import Comparison
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality
 from zlocus.products.match_curve_drawing import SVG_PX
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
-from zlocus.products.report.comparison import comparison_part
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.report.sampling import Survey, survey_rasters
 
+if TYPE_CHECKING:
+    from zlocus.evaluation.comparison import Comparison
+
+HERE = Path(__file__).parent
 NEEDED = ("config", "versions", "inputs", "stages", "orientation", "grid", "heights", "coverage")
 QUANTILES = (10, 25, 50, 75, 90)
 LABEL_WORDS = {1: "good", 0: "fair", -1: "poor"}
@@ -74,11 +76,13 @@ def write_report(out: Path, comparison: Comparison | None = None) -> Path:
 
 def rendered(values: Mapping[str, Any]) -> str:
     """The page, rendered from the values of `context`."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    from zlocus.products.report.compiled_page import CompiledPages
 
     environment = Environment(
-        loader=PackageLoader("zlocus.products.report", ""), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        bytecode_cache=CompiledPages(HERE / "__pycache__"),
     )  # fmt: skip
     digest = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode("ascii")
     return environment.get_template("page.html.jinja").render(**values, script=SCRIPT, script_hash=digest) + "\n"
@@ -96,7 +100,11 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
     light = run["config"]["options"]["products"]
     sun_deg = (light["sun_azimuth_deg"], light["sun_altitude_deg"])
     views = run["orientation"]["views"]
-    reference = None if comparison is None else comparison_part(out, comparison)
+    reference = None
+    if comparison is not None:
+        from zlocus.products.report.comparison import comparison_part
+
+        reference = comparison_part(out, comparison)
     paragraph = words.summary(survey, run, crs, quantiles)
     if reference is not None:
         paragraph += " " + reference["sentence"]

@@ -6,16 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
-from zlocus.evaluation.evaluate import Evaluation
-from zlocus.evaluation.statistics import ErrorStatistics
-from zlocus.evaluation.table import shift_text
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.report.sampling import Survey
+
+if TYPE_CHECKING:
+    from zlocus.evaluation.evaluate import Evaluation
+    from zlocus.evaluation.statistics import ErrorStatistics
 
 # As docs/reference/quality.md has them; a test keeps them the same.
 MEANINGS = {
@@ -246,6 +247,8 @@ def against_reference(evaluation: Evaluation, reference: str) -> str:
 
 def _aligned(evaluation: Evaluation) -> str:
     """The aligned figures, with the shift that was removed, in a sentence; or why there are none."""
+    from zlocus.evaluation.table import shift_text
+
     shift, aligned = evaluation.found_shift, evaluation.aligned_accuracy
     if shift is None or aligned is None:
         return f"There are no aligned figures, because {evaluation.no_shift}."
