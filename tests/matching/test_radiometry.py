@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import LinearOperator, cg
 
 from orientation_scenes import BASE_HEIGHT_M, GSD_M, AffineSensor, ArrayImage, image_of
 from zlocus.core.scene import View
@@ -15,8 +16,10 @@ from zlocus.matching.radiometry import (
     MAX_POINTS,
     MIN_POINTS,
     PART_PX,
+    RELATIVE_TOLERANCE,
     SAMPLE_ROWS,
     SQUARE_PX,
+    conjugate_gradients,
     grey_at,
     grey_scales,
     image_grey,
@@ -34,6 +37,22 @@ FIELD_PX, BRIGHTER = 90, 6.0
 # Units of albedo, of which the ground's deviation is 1; and a share of a gain.
 ALBEDO, GAIN = 0.02, 0.02
 FLOAT32_GREY = 1e-3
+
+
+def test_conjugate_gradients_are_those_of_scipy():
+    """To the last bit: from 0 and from elsewhere, with a preconditioner; and for a right side of 0."""
+    rng = np.random.default_rng(3)
+    for size in (1, 6, 30):
+        root = rng.normal(size=(size, size))
+        matrix, scale = root @ root.T + np.eye(size), rng.uniform(0.1, 2.0, size)
+        inverse = LinearOperator((size, size), matvec=lambda v, scale=scale: scale * v, dtype=float)
+        for right, first in (
+            (rng.normal(size=size), np.zeros(size)), (rng.normal(size=size), rng.normal(size=size)),
+            (np.zeros(size), np.ones(size)),
+        ):  # fmt: skip
+            expected, _ = cg(matrix, right, first, rtol=RELATIVE_TOLERANCE, M=inverse)
+            found = conjugate_gradients(lambda v, matrix=matrix: matrix @ v, right, first, inverse.matvec)
+            np.testing.assert_array_equal(found, expected)
 
 
 def albedo():

@@ -12,6 +12,7 @@ from reference import selection as plain
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import SelectionOptions
 from zlocus.matching.view_ranking import (
+    FEW_CELLS,
     FeaturePoints,
     NeighbourSearch,
     OrderSource,
@@ -230,6 +231,19 @@ def test_cells_do_not_depend_on_each_other():
         np.testing.assert_array_equal(getattr(found, name)[some], getattr(alone, name))
     np.testing.assert_array_equal(np.sort(found.images, axis=1), np.broadcast_to(np.arange(6), (20500, 6)))
     assert set(found.order_source.tolist()) == set(OrderSource)
+
+
+@pytest.mark.parametrize("n_points", [0, 1, 2, 7, 400])
+def test_few_cells_find_the_neighbours_that_many_find(n_points):
+    """With all distances, and with a tree; also at distances of the radius, and at points of equal distance."""
+    rng = np.random.default_rng(n_points)
+    xy = np.round(rng.uniform(0, 60, (n_points, 2)))
+    at = np.concatenate([np.round(rng.uniform(-20, 80, (2 * FEW_CELLS, 2))), xy[:3] + np.array([RADIUS_PX, 0.0])])
+    together = NeighbourSearch(xy, OPTIONS).of(at)
+    for cell in range(len(at)):
+        alone = NeighbourSearch(xy, OPTIONS).of(at[cell : cell + 1])
+        np.testing.assert_array_equal(alone.index, together.index[together.start[cell] : together.start[cell + 1]])
+        assert alone.order_source[0] == together.order_source[cell]
 
 
 def test_no_cells_at_all():

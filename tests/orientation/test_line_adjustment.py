@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from zlocus.orientation import line_adjustment
 from zlocus.orientation.line_adjustment import estimated_line_shifts, no_line_shifts, without_line_shifts
 from zlocus.orientation.triangulate import Observations, triangulate
 
@@ -116,3 +117,24 @@ def test_observations_of_other_views_stay_as_they_are():
     moved = adjustment.observations.xy[mine] - straight.xy[mine]
     np.testing.assert_allclose(moved, found[0].at(adjustment.observations.xy[mine, 1]))
     assert replace(found[0], shift_px=found[0].shift_px * 0.0).max_px == 0.0
+
+
+@pytest.mark.parametrize("n_nodes", [2, 13, 60])
+def test_the_likeliest_process_is_that_of_plain_formulas(n_nodes):
+    """Rasmussen and Williams 2006, equation 2.30, with a determinant and a solution for each process."""
+    rng = np.random.default_rng(n_nodes)
+    for strength in (0.0, 1.0, 30.0, 1000.0):
+        root = rng.normal(size=(3 * n_nodes, n_nodes))
+        normal, pull = root.T @ root, strength * rng.normal(size=n_nodes)
+        odds = []
+        for process in line_adjustment._processes(n_nodes):
+            both = normal + process.precision
+            explained = pull @ np.linalg.solve(both, pull)
+            odds.append(0.5 * (process.log_determinant - np.linalg.slogdet(both)[1] + explained))
+        best, found = int(np.argmax(odds)), line_adjustment._likeliest(normal, pull)
+        if max(odds) > line_adjustment.MIN_LOG_ODDS:
+            expected = line_adjustment._processes(n_nodes)[best]
+            assert found.log_determinant == expected.log_determinant
+            np.testing.assert_array_equal(found.precision, expected.precision)
+        else:
+            assert found is None
