@@ -18,11 +18,13 @@ RENDERED_VIEWS = ("n1", "f1", "b1", "n2", "f2", "b2")
 COVERAGE_SHORT = 3
 # Runs a command from a small process, because the peak memory of a child begins with the memory of its parent.
 MEASURE = """
-import resource, subprocess, sys
+import resource, subprocess, sys, time
+begun = time.perf_counter()
 status = subprocess.call(sys.argv[2:])
+wall_s = time.perf_counter() - begun
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 with open(sys.argv[1], "w") as file:
-    print(used.ru_utime + used.ru_stime, used.ru_maxrss, file=file)
+    print(used.ru_utime + used.ru_stime, used.ru_maxrss, wall_s, file=file)
 sys.exit(status)
 """
 
@@ -82,11 +84,13 @@ class Figure:
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU of a command with its children, memory of its largest process (GB of 1024^3 bytes), and its exit status."""
+    """CPU of a command with its children, memory of its largest process (GB of 1024^3 bytes), its exit status, and the
+    time from its start to its end."""
 
     cpu_s: float
     peak_gb: float
     status: int = 0
+    wall_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -143,8 +147,8 @@ def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = N
         if done.returncode not in accept:
             said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()
             raise CannotRun(f"`{' '.join(map(str, command[:3]))} ...` exits {done.returncode}: {said[-1]}")
-        cpu_s, peak_kb = map(float, usage.read_text().split())
-    return Usage(cpu_s, peak_kb / 1024**2, done.returncode)
+        cpu_s, peak_kb, wall_s = map(float, usage.read_text().split())
+    return Usage(cpu_s, peak_kb / 1024**2, done.returncode, wall_s)
 
 
 def rendered_images(scene: Path, views: tuple[str, ...] = RENDERED_VIEWS) -> list[Path]:

@@ -74,6 +74,7 @@ ROWS: dict[str, Row] = {
     "features": Row("rows.methods:features", WITH_RENDERER),
     "kernels": Row("rows.resources:kernels"),
     "speed": Row("rows.resources:speed", WITH_RENDERER, is_slow=True),
+    "start-up": Row("rows.resources:start_up", WITH_RENDERER),
     "memory": Row("rows.resources:memory", WITH_RENDERER, is_slow=True),
     "inspect": Row("inspecting:inspect", WITH_RENDERER),
     "inspect-large": Row("inspecting:inspect_large", WITH_RENDERER, is_slow=True),

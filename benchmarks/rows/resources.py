@@ -12,10 +12,18 @@ import rasterio
 from rows.rendered import VIEWS, town_figures
 from workplace import ROOT, ZLOCUS, CannotRun, Figure, Usage, Workplace, render, rendered_images, run
 
+# Runs a program on one core.
+ON_ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+os.execv(sys.argv[1], sys.argv[1:])
+"""
 LARGE_SIDE_CELLS = 4000
 # A town of more than 4 million cells of 0.5 m, and the CPU seconds per million cells that it may take.
 SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
 SPEED_BARS_S = {"six": 8.0, "three": 4.0}
+# Cells along a side of a town whose images have about 300 x 300 pixels, and how often its surface is made.
+SMALL_SIDE_CELLS, N_SMALL_RUNS = 280, 9
 # Signals in the row `signals`; the tests send fewer of them.
 N_SIGNALS = 30
 
@@ -110,6 +118,28 @@ def speed(workplace: Workplace) -> list[Figure]:
         )  # fmt: skip
         figures += town_figures(name, workplace.judge(out / "dsm.tif", scene), {})
     return [Figure("million cells", million_cells), *figures]
+
+
+def start_up(workplace: Workplace) -> list[Figure]:
+    """Time of the whole program on a small pair with the usual options, on one core and with compiled kernels.
+
+    The shortest of several runs counts: the others waited for other work of the machine.
+    """
+    scene, images = workplace.out / "scene", ("n1", "f1")
+    render(scene, "city", SMALL_SIDE_CELLS)
+    on_one_core = [sys.executable, "-c", ON_ONE_CORE, ZLOCUS]
+    command = [*on_one_core, "dsm", *rendered_images(scene, images), "-o", workplace.out / "dsm", "--overwrite"]
+    runs = [run(command) for _ in range(N_SMALL_RUNS + 1)][1:]
+    with rasterio.open(rendered_images(scene, images)[0]) as image:
+        pixels = image.width * image.height
+    return [
+        Figure(
+            "time from start to end, one core", min(used.wall_s for used in runs), "s", at_most=1.5,
+            fails_when="modules are imported, or kernels are read, that a usual run does not need",
+        ),
+        Figure("CPU", min(used.cpu_s for used in runs), "s"),
+        Figure("pixels per image", pixels),
+    ]  # fmt: skip
 
 
 def signals(workplace: Workplace) -> list[Figure]:

@@ -254,6 +254,16 @@ def test_two_threads_do_the_work_twice():
     assert threads.run_together([bench_kernels.Case(burn, 1, "call")], 1).cpu_s > 0.04
 
 
+def test_the_time_of_a_small_pair_is_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(resources, "N_SMALL_RUNS", 1)
+    monkeypatch.setattr(resources, "SMALL_SIDE_CELLS", 96)
+    figures = {figure.what: figure for figure in resources.start_up(Workplace(None, tmp_path))}
+    assert figures["time from start to end, one core"].at_most == 1.5
+    assert figures["time from start to end, one core"].value > 0.9 * figures["CPU"].value > 0.5
+    assert 100**2 < figures["pixels per image"].value < 200**2
+    assert (tmp_path / "dsm" / "report.html").exists()
+
+
 def test_the_benchmarks_of_the_kernels(tmp_path, monkeypatch):
     """All of them on scenes of 64 cells, by the row of the acceptance table; speeds mean nothing there."""
     # Where these tests run in several processes, pytest-benchmark would believe that the benchmarks do so too.
