@@ -1,9 +1,11 @@
-"""Plain versions of the kernels that match features and patches."""
+"""Plain versions of the kernels that match features and patches, and of the search for neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+
+from zlocus.core.footprints import ground_box
 
 SAME_PLACE_PX, UNRELATED_DISTANCE, DESCRIPTOR_LENGTH_UNITS = 2.0, 0.9, 2**14
 
@@ -66,3 +68,13 @@ def patch_shift(patch, square, warp, centre, reach, step=0.02):
         best = max(((best[0] + c * spacing, best[1] + r * spacing) for r in (-1, 0, 1) for c in (-1, 0, 1)), key=ncc)
         spacing /= 2
     return np.array([*best, ncc(best)])
+
+
+def neighbours_of_all_pairs(views, z_range, margin_px):
+    """Whether the boxes around the footprints of two different views touch, (i, i) bool; every pair is compared."""
+    boxes = [ground_box(view, z_range, margin_px) for view in views]
+    near = np.zeros((len(views), len(views)), bool)
+    for a, (low_a, high_a) in enumerate(boxes):
+        for b, (low_b, high_b) in enumerate(boxes):
+            near[a, b] = a != b and (low_a <= high_b).all() and (low_b <= high_a).all()
+    return near

@@ -10,10 +10,10 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.core.errors import GeometryError, ZlocusWarning
 from zlocus.core.grid import CellWindow, Grid
@@ -65,14 +65,22 @@ def ground_box(view: View, z_range: tuple[float, float], margin_px: float = 0.0)
     return np.stack([xy.min(axis=0) - margin, xy.max(axis=0) + margin])
 
 
+def views_near(views: Sequence[View], area: Bounds, z_range: tuple[float, float]) -> tuple[View, ...]:
+    """The views that may show ground of an area (m) between two heights (m). Boxes around footprints are compared."""
+    (west, south, east, north), near = area, []
+    for view in views:
+        low, high = ground_box(view, z_range)
+        if low[0] <= east and west <= high[0] and low[1] <= north and south <= high[1]:
+            near.append(view)
+    return tuple(near)
+
+
 def is_shared(scene: Scene, z: float) -> bool:
     """Whether two views or more see the same ground at a height (m)."""
-    from shapely import MultiPoint, STRtree
+    from shapely import MultiPoint
 
     hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
-    tree = STRtree(hulls)
-    first, second = tree.query(hulls, predicate="intersects")
-    return any(hulls[i].intersection(hulls[j]).area > 0 for i, j in zip(first, second, strict=True) if i < j)
+    return any(hulls[i].intersection(hulls[j]).area > 0 for i, j in overlapping_pairs(hulls).tolist())
 
 
 def ground_sample_distance(view: View, z: float) -> float:
@@ -100,15 +108,15 @@ def check_overlap(scene: Scene, heights: float | Sequence[float]) -> None:
         No two footprints overlap; the message says where each view lies.
     """
     # shapely costs 0.1 s to import, and only this check needs it.
-    from shapely import MultiPoint, STRtree
+    from shapely import MultiPoint
 
     levels = np.atleast_1d(np.asarray(heights, float))
     n_views = len(scene.views)
     overlap = np.zeros(n_views, bool)
     for z in levels:
         hulls = [MultiPoint(footprint(view, z)).convex_hull for view in scene.views]
-        for i, j in zip(*STRtree(hulls).query(hulls, predicate="intersects"), strict=True):
-            if i < j and hulls[i].intersection(hulls[j]).area > 0:
+        for i, j in overlapping_pairs(hulls).tolist():
+            if not overlap[[i, j]].all() and hulls[i].intersection(hulls[j]).area > 0:
                 overlap[[i, j]] = True
     at = f"at heights of {levels.min():g} to {levels.max():g} m" if len(levels) > 1 else f"at {levels[0]:g} m"
     if not overlap.any():
@@ -134,6 +142,15 @@ def _extent(bounds: tuple[float, ...]) -> str:
     return f"E {xmin:.0f} to {xmax:.0f} m, N {ymin:.0f} to {ymax:.0f} m"
 
 
+def overlapping_pairs(outlines: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
+    """Numbers (n, 2) of the polygons that touch each other, each pair once and in ascending order."""
+    from shapely import STRtree
+
+    first, second = STRtree(outlines).query(outlines, predicate="intersects")
+    pairs = np.column_stack([first, second])[first < second]
+    return np.asarray(pairs[np.lexsort(pairs.T[::-1])])
+
+
 def shared_ground(scene: Scene, z_range: tuple[float, float]) -> Bounds:
     """Bounds (xmin, ymin, xmax, ymax), m, of the ground that two views or more may see between two heights (m).
 
@@ -142,20 +159,19 @@ def shared_ground(scene: Scene, z_range: tuple[float, float]) -> Bounds:
     GeometryError
         No two footprints overlap.
     """
-    from shapely import MultiPoint
+    from shapely import MultiPoint, area, bounds, intersection
 
-    hulls = []
-    for view in scene.views:
-        points = np.concatenate([footprint(view, z) for z in z_range])
-        hulls.append(MultiPoint(points).convex_hull)
-    shared = [a.intersection(b) for a, b in combinations(hulls, 2)]
-    bounds = np.array([part.bounds for part in shared if part.area > 0])
-    if not len(bounds):
+    points = [np.concatenate([footprint(view, z) for z in z_range]) for view in scene.views]
+    hulls = np.array([MultiPoint(each).convex_hull for each in points])
+    first, second = overlapping_pairs(hulls).T
+    shared = intersection(hulls[first], hulls[second])
+    extents = bounds(shared[area(shared) > 0])
+    if not len(extents):
         raise GeometryError(
             f"No two images see the same ground at heights of {z_range[0]:.0f} to {z_range[1]:.0f} m. Check the RPCs, "
             "or give other heights with --heights."
         )
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    low, high = extents[:, :2].min(axis=0), extents[:, 2:].max(axis=0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
@@ -271,14 +287,10 @@ def view_geometry(view: View, z: float) -> ViewGeometry:
 
 def pair_geometries(views: Sequence[View], outlines: Sequence[Any], z: float) -> list[PairGeometry]:
     """All pairs of views that share ground at height z (m). outlines : polygon of each view's footprint."""
-    from shapely import STRtree
-
-    first, second = STRtree(list(outlines)).query(list(outlines), predicate="intersects")
-    touching = {(int(i), int(j)) for i, j in zip(first, second, strict=True)}
     pairs = []
-    for i, j in combinations(range(len(views)), 2):
-        shared = outlines[i].intersection(outlines[j]) if (i, j) in touching else None
-        if shared is None or not shared.area > 0:
+    for i, j in overlapping_pairs(outlines).tolist():
+        shared = outlines[i].intersection(outlines[j])
+        if not shared.area > 0:
             continue
         middle = np.array([shared.centroid.x, shared.centroid.y, z])
         ratio = float(np.hypot(*(parallax_rate_at(views[i], middle) - parallax_rate_at(views[j], middle))))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray, Scanning, bare
 from zlocus.orientation.shift_adjustment import Adjustment, huber_weight, robust_sigma
-from zlocus.orientation.triangulate import Observations, summed
+from zlocus.orientation.triangulate import Observations, rows_of_views, summed
 from zlocus.sensors.line_shifts import LineShifts
 
 # Lines between two nodes: this many, or more in images so long that they would have more nodes.
@@ -53,9 +53,8 @@ def estimated_line_shifts(views: Sequence[View], adjustment: Adjustment) -> tupl
     adjustment : of the ties, with the corrected cameras.
     """
     observations, ground_points = adjustment.observations, adjustment.ground_points
-    estimators = [
-        _Estimator.of(view, observations.xy[observations.view == number, 1]) for number, view in enumerate(views)
-    ]
+    rows = rows_of_views(observations, len(views))
+    estimators = [_Estimator.of(view, observations.xy[mine, 1]) for view, mine in zip(views, rows, strict=True)]
     if not any(estimators):
         return no_line_shifts(views)
     horizontal = ground_points.by_ground[:, :, :2]
@@ -70,8 +69,7 @@ def estimated_line_shifts(views: Sequence[View], adjustment: Adjustment) -> tupl
         weight = np.where(is_usable, huber_weight(left, sigma), 0.0)
         left = residual - shift
         left = left - _explained_by_motion(left, horizontal, weight, observations.point, len(ground_points.xyz))
-        for number, estimator in enumerate(estimators):
-            mine = observations.view == number
+        for mine, estimator in zip(rows, estimators, strict=True):
             if estimator is not None:
                 estimator.fit(left[mine] + shift[mine], weight[mine], sigma, may_choose=iteration == 0)
                 shift[mine] = estimator.at_ties()

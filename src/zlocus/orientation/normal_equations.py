@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import sparse
 
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.control import TerrainHeights
@@ -26,9 +26,16 @@ from zlocus.orientation.determinability import (
     mean_camera_heights,
     undetermined_parameters,
 )
+from zlocus.orientation.information import (
+    MAX_DENSE_PARAMETERS,
+    DenseInformation,
+    Information,
+    WeakDirections,
+    weak_directions,
+)
 from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors
 from zlocus.orientation.shift_adjustment import HUBER_SIGMAS, huber_weight, robust_sigma
-from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points, summed
+from zlocus.orientation.triangulate import Observations, ground_jacobian, project_points, rows_of_views, summed
 
 MAX_ITERATIONS = 100
 TOLERANCE_PX = 1e-3
@@ -88,6 +95,12 @@ class Problem:
         return bool(len(self.control_xyz)) or self.terrain is not None
 
     @property
+    def is_dense(self) -> bool:
+        """Whether the matrices of the parameters are dense: in small problems, and where images share parameters of a
+        self-calibration, whose correlations are compared."""
+        return self.n_parameters <= MAX_DENSE_PARAMETERS or any(group.is_calibration for group in self.groups)
+
+    @property
     def kinds(self) -> NDArray[np.int64]:
         """Number (p,) of the kind of each parameter: one kind of group and one standard deviation are one kind."""
         kinds = [(group.kind, sigma) for group in self.groups for sigma in group.sigma]
@@ -118,37 +131,15 @@ class GroundInformation:
 
 @dataclass(frozen=True, eq=False)
 class ReducedEquations:
-    """Normal equations of the parameters once ground points are eliminated: normal (p, p) px2, pull (p,) px2; mixed :
-    sparse (p, 3 n); covariance (n, 3, 3) m2 per px2, 0 where a point is not fixed; pull_of_points (n, 3) px2 per m."""
+    """Normal equations of the parameters once ground points are eliminated: normal (p, p) px2, dense or sparse (see
+    `Problem.is_dense`); pull (p,) px2; mixed : sparse (p, 3 n); covariance (n, 3, 3) m2 per px2, 0 where a point is not
+    fixed; pull_of_points (n, 3) px2 per m."""
 
-    normal: FloatArray
+    normal: Any
     pull: FloatArray
     mixed: Any
     covariance: FloatArray
     pull_of_points: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class WeakDirections:
-    """Directions of the parameters that ties hardly determine.
-
-    They would absorb the small common errors of all ties, enlarged. So the information of ties in these directions is
-    left out, and priors and control decide.
-
-    ahead, back : (p, k), whose product ahead @ back.T takes the share of the weak directions from a pull of the ties.
-    """
-
-    ahead: FloatArray
-    back: FloatArray
-
-    def without(
-        self, full_equations: ReducedEquations, tie_equations: ReducedEquations
-    ) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix (p, p) and pull (p,) of all information, except that of ties in the weak directions."""
-        left = tie_equations.normal - self.ahead @ (self.back.T @ tie_equations.normal)
-        determined = left - (left @ self.back) @ self.ahead.T
-        normal = full_equations.normal - tie_equations.normal + determined
-        return normal, full_equations.pull - self.ahead @ (self.back.T @ tie_equations.pull)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,43 +202,34 @@ def solve(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Solution
         of_ties = np.where(problem.is_tie, weight, 0.0)
         full = reduced(problem, linearised, residual, weight, ground_information(problem, xyz, sigma))
         ties = reduced(problem, linearised, residual, of_ties, None) if problem.is_controlled else full
-        weak = weak_directions(problem, linearised, of_ties, ties.normal) if weak is None else weak
-        normal, pull = weak.without(full, ties)
-        covariance = covariance_of(normal, sigma, prior_variance.variance)
+        weak = weak_directions_of_ties(problem, linearised, of_ties, ties.normal) if weak is None else weak
+        information = weak.information_without(full.normal, ties.normal)
+        pull = weak.pull_without(full.pull, ties.pull)
+        covariance = information.covariance(sigma, prior_variance.variance)
         if n_steps == MAX_ITERATIONS or (prior_variance.has_converged and moved_px < TOLERANCE_PX):
             break
         if moved_px < TOLERANCE_PX:
             if prior_variance.held_parameters is None:
-                heights = block_heights(problem, sensors, full)
-                known = BlockInformation(normal / sigma**2, full.normal / sigma**2, problem.is_controlled)
-                held = undetermined_parameters(problem.groups, known, heights)
+                held = held_parameters(problem, sensors, full, information, sigma)
                 prior_variance = replace(prior_variance, held_parameters=held)
-            prior_variance = estimated_variance(problem, prior_variance, parameters, np.diag(covariance))
-            covariance = covariance_of(normal, sigma, prior_variance.variance)
-        step = covariance @ (pull / sigma**2 - parameters / prior_variance.variance)
+            prior_variance = estimated_variance(problem, prior_variance, parameters, covariance.variances)
+            covariance = information.covariance(sigma, prior_variance.variance)
+        step = covariance.times(pull / sigma**2 - parameters / prior_variance.variance)
         rest = full.pull_of_points - (full.mixed.T @ step).reshape(-1, 3)
         parameters = parameters + step
         moved_px = float(np.abs(linearised.by_parameters @ step).max(initial=0.0))
         xyz = xyz + np.einsum("nij,nj->ni", full.covariance, rest)
         n_steps += 1
-    n_determined = len(parameters) - weak.ahead.shape[1]
+    n_determined = len(parameters) - weak.n
     used = of_ties > 0.0
     redundancy = 2 * int(used.sum()) - 3 * len(np.unique(problem.observations.point[used])) - n_determined
     sigma0 = np.sqrt((residual[used] ** 2).sum() / redundancy) if redundancy > 0 else np.nan
     if redundancy > 0:
         # Residuals are smaller than the noise, because parameters and ground points follow a part of it.
-        covariance = covariance_of(normal, sigma * np.sqrt(2 * used.sum() / redundancy), prior_variance.variance)
+        covariance = information.covariance(sigma * np.sqrt(2 * used.sum() / redundancy), prior_variance.variance)
     parameters = np.where(prior_variance.is_held, 0.0, parameters)
-    of_parameters = np.sqrt(np.diag(covariance)), prior_variance.is_held, prior_variance.held_parameters or ()
+    of_parameters = np.sqrt(covariance.variances), prior_variance.is_held, prior_variance.held_parameters or ()
     return Solution(parameters, *of_parameters, xyz, residual, float(sigma0), redundancy, n_determined, n_steps)
-
-
-def covariance_of(normal: FloatArray, sigma: float, variance: FloatArray) -> FloatArray:
-    """Covariance matrix (p, p) of the parameters, in units of their sigma.
-
-    normal : (p, p) px2; sigma : noise of the image coordinates, px; variance : (p,) prior variances.
-    """
-    return np.asarray(linalg.inv(normal / sigma**2 + np.diag(1.0 / variance)))
 
 
 def estimated_variance(
@@ -272,6 +254,20 @@ def estimated_variance(
         return PriorVariance(new, n_rounds, False, prior_variance.is_held, prior_variance.held_parameters)
     is_held = undetermined | (~is_shown & (variance < 1.0))
     return PriorVariance(np.where(is_held, new, 1.0), n_rounds, True, is_held, prior_variance.held_parameters)
+
+
+def held_parameters(
+    problem: Problem,
+    sensors: Sequence[SensorModel],
+    equations: ReducedEquations,
+    information: Information,
+    sigma: float,
+) -> tuple[HeldParameter, ...]:
+    """The parameters of a self-calibration that are held, see `undetermined_parameters`. sigma : noise now, px."""
+    if not isinstance(information, DenseInformation):  # there is no self-calibration, see `Problem.is_dense`
+        return ()
+    known = BlockInformation(information.normal / sigma**2, equations.normal / sigma**2, problem.is_controlled)
+    return undetermined_parameters(problem.groups, known, block_heights(problem, sensors, equations))
 
 
 def block_heights(problem: Problem, sensors: Sequence[SensorModel], equations: ReducedEquations) -> BlockHeights:
@@ -301,7 +297,7 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
     sensors = corrected_sensors(problem.groups, problem.sensors, parameters)
     by_ground = ground_jacobian(sensors, problem.observations, xyz)
     here = project_points(sensors, problem.observations, xyz)
-    rows_of = [np.flatnonzero(problem.observations.view == i) for i in range(len(sensors))]
+    rows_of, groups_of = rows_of_views(problem.observations, len(sensors)), groups_of_views(problem)
     values, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     first = 0
     for group in problem.groups:
@@ -310,7 +306,7 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
             changed[k] += DIFFERENCE
             for i in group.views:
                 at = xyz[problem.observations.point[rows_of[i]]]
-                moved = corrected_sensor(problem, changed, i).image_from_ground(at) - here[rows_of[i]]
+                moved = corrected_sensor(problem, changed, i, groups_of[i]).image_from_ground(at) - here[rows_of[i]]
                 values.append(moved.ravel() / DIFFERENCE)
                 rows.append((2 * rows_of[i][:, None] + np.arange(2)).ravel())
                 columns.append(np.full(2 * len(at), k))
@@ -323,13 +319,24 @@ def linearise(problem: Problem, parameters: FloatArray, xyz: FloatArray) -> Line
     return Linearised(matrix, np.where(usable[:, None, None], by_ground, 0.0), usable)
 
 
-def corrected_sensor(problem: Problem, parameters: FloatArray, view: int) -> SensorModel:
-    """The sensor of one view, corrected by all parameter groups that it belongs to."""
-    sensor, first = problem.sensors[view], 0
+def groups_of_views(problem: Problem) -> list[list[tuple[ParameterGroup, int]]]:
+    """For each view the groups that it belongs to, with the number of their first parameter."""
+    groups: list[list[tuple[ParameterGroup, int]]] = [[] for _ in problem.sensors]
+    first = 0
     for group in problem.groups:
-        if view in group.views:
-            sensor = group.correct(sensor, parameters[first : first + len(group)] * group.sigma)
+        for view in group.views:
+            groups[view].append((group, first))
         first += len(group)
+    return groups
+
+
+def corrected_sensor(
+    problem: Problem, parameters: FloatArray, view: int, groups: Sequence[tuple[ParameterGroup, int]]
+) -> SensorModel:
+    """The sensor of one view, corrected by all parameter groups that it belongs to. groups : see `groups_of_views`."""
+    sensor = problem.sensors[view]
+    for group, first in groups:
+        sensor = group.correct(sensor, parameters[first : first + len(group)] * group.sigma)
     return sensor
 
 
@@ -383,7 +390,8 @@ def reduced(
     weighted = sparse.diags_array(np.repeat(used, 2)) @ linearised.by_parameters
     mixed = weighted.T @ spread(linearised.by_ground, point, n)
     eliminated = mixed @ sparse.bsr_array((covariance, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
-    normal = (linearised.by_parameters.T @ weighted - eliminated @ mixed.T).toarray()
+    normal = linearised.by_parameters.T @ weighted - eliminated @ mixed.T
+    normal = normal.toarray() if problem.is_dense else normal.tocsr()
     pull = linearised.by_parameters.T @ pulls.ravel() - eliminated @ pull_of_points.ravel()
     return ReducedEquations(normal, pull, mixed, covariance, pull_of_points)
 
@@ -396,22 +404,14 @@ def spread(by_ground: FloatArray, point: NDArray[np.int64], n_points: int) -> An
     return sparse.csr_array((by_ground.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
-def weak_directions(problem: Problem, linearised: Linearised, weight: FloatArray, normal: FloatArray) -> WeakDirections:
-    """Directions in which ties have almost no information per image point.
-
-    See `parameter_groups.MIN_INFORMATION_IN_IMAGE`.
-
-    normal : (p, p) of the ties alone.
-    """
+def weak_directions_of_ties(
+    problem: Problem, linearised: Linearised, weight: FloatArray, normal: Any
+) -> WeakDirections:
+    """Directions in which ties have almost no information per image point. normal : (p, p) of the ties alone."""
     squared = linearised.by_parameters.multiply(linearised.by_parameters).T @ np.repeat(weight, 2)
     min_information = np.concatenate([np.full(len(group), group.min_information) for group in problem.groups])
-    scale = np.sqrt(squared * min_information)
-    linked = scale > 0.0
-    inverse = np.where(linked, 1.0 / np.where(linked, scale, 1.0), 0.0)
     n_views = max(len(np.unique(problem.observations.view[weight > 0.0])), 1)
-    scaled = normal * inverse[:, None] * inverse
-    _, vectors = linalg.eigh(scaled, subset_by_value=(-np.inf, 1.0 / n_views**2))
-    return WeakDirections(scale[:, None] * vectors, inverse[:, None] * vectors)
+    return weak_directions(normal, np.sqrt(squared * min_information), n_views)
 
 
 def inverses(matrix: FloatArray) -> FloatArray:

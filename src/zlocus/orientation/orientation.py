@@ -19,7 +19,7 @@ from zlocus.orientation.plausibility import Doubt, ExcludedImage, doubts_about
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_points import first_ground_points, with_rough_ties
 from zlocus.orientation.tie_refinement import RefinedTies, refine_ties
-from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation, pair_orientations, view_orientation
+from zlocus.orientation.tie_residuals import PairOrientation, ViewOrientation, pair_orientations, view_orientations
 from zlocus.orientation.ties import Progress, find_ties, sift_tolerance_factor
 from zlocus.orientation.triangulate import Observations, ground_jacobian
 from zlocus.sensors.correction import ShiftedModel
@@ -202,9 +202,7 @@ def orient(
     rough = without_line_shifts(ties.observations.kept(~np.isin(ties.observations.view, wrong)), line_shifts)
     rough_inlier_px = options.inlier_px * sift_tolerance_factor(scene.views, options)
     tie_points = with_rough_ties(adjustment, sensors, rough, xyz, rough_inlier_px)
-    views = tuple(
-        view_orientation(view, i, adjustment, sensors[i], line_shifts[i]) for i, view in enumerate(scene.views)
-    )
+    views = view_orientations(scene.views, adjustment, sensors, line_shifts)
     heights = tie_points.xyz[supported(tie_points.xyz, tie_points.sigma_z_m), 2]
     doubts = doubts_about(scene.views, [v.residuals_after.median for v in views], [v.shift_px for v in views], heights)
     return Orientation(

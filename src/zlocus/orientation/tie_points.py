@@ -11,7 +11,7 @@ from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.orientation.shift_adjustment import Adjustment, renumbered, without_outliers, without_shifts
 from zlocus.orientation.ties import Ties
-from zlocus.orientation.triangulate import GroundPoints, Observations, triangulate
+from zlocus.orientation.triangulate import GroundPoints, Observations, rows_by_view, triangulate
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,9 @@ def first_ground_points(scene: Scene, ties: Ties) -> FloatArray:
     observations = ties.observations
     xyz = np.full((len(ties.z), 3), np.nan)
     _, first = np.unique(observations.point, return_index=True)
-    for i, view in enumerate(scene.views):
-        rows = first[observations.view[first] == i]
+    of_view = rows_by_view(observations.view[first], len(scene.views))
+    for view, mine in zip(scene.views, of_view, strict=True):
+        rows = first[mine]
         point = observations.point[rows]
         xyz[point] = view.sensor.ground_from_image(observations.xy[rows], ties.z[point])
     return xyz

@@ -18,7 +18,7 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.orientation.kernels.patches import patch_shifts
 from zlocus.orientation.sift import parts, reduction
 from zlocus.orientation.ties import Ties
-from zlocus.orientation.triangulate import Observations
+from zlocus.orientation.triangulate import Observations, rows_by_view, rows_of_views
 
 # A view with fewer observations that could be refined (another season, haze) keeps them all as SIFT found them.
 MIN_REFINED_OF_VIEW = 50
@@ -68,10 +68,11 @@ def refine_ties(
     found = np.zeros((len(observations), 3))
     reach = math.ceil(max(reduction(held_window(view.image)[2:], options) for view in views) / 2.0)
     half = 2 * (PATCH_PX // 2) + reach + BORDER_PX
+    of_view = rows_by_view(observations.view[other], len(views))
 
     def refine_view(i: int) -> None:
         """Refine the observations of one view."""
-        for squares in squares_around(views[i], whole, other[observations.view[other] == i], half):
+        for squares in squares_around(views[i], whole, other[of_view[i]], half):
             rows, of = squares.rows, reference[squares.rows]
             out = np.empty((len(rows), 3))
             centres = expected[rows] - whole[rows] + half
@@ -97,12 +98,8 @@ def reference_rows(observations: Observations, by_ground: FloatArray, n_views: i
     """
     along = np.einsum("mij,mj->mi", inverses(by_ground[:, :, :2]), by_ground[:, :, 2])
     parallax_rate = np.nan_to_num(np.hypot(*along.T), nan=np.inf)
-    of_view = np.array(
-        [
-            np.median(parallax_rate[observations.view == i]) if (observations.view == i).any() else np.inf
-            for i in range(n_views)
-        ]
-    )
+    rows = rows_of_views(observations, n_views)
+    of_view = np.array([np.median(parallax_rate[mine]) if len(mine) else np.inf for mine in rows])
     order = np.lexsort((observations.view, of_view[observations.view], observations.point))
     _, first = np.unique(observations.point[order], return_index=True)
     row_of = np.zeros(int(observations.point.max()) + 1, np.int64)
@@ -144,8 +141,10 @@ def reference_patches(
     half = PATCH_PX // 2 + 1
     patches, usable = np.zeros((len(view), 2 * half + 1, 2 * half + 1), np.float32), np.zeros(len(view), bool)
 
+    of_view = rows_by_view(view[rows], len(views))
+
     def read(i: int) -> None:
-        for squares in squares_around(views[i], whole, rows[view[rows] == i], half):
+        for squares in squares_around(views[i], whole, rows[of_view[i]], half):
             patches[squares.rows], usable[squares.rows] = squares.pixels, squares.valid
 
     deque(run_all(read, range(len(views)), threads), maxlen=0)

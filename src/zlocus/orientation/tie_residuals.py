@@ -16,8 +16,6 @@ from zlocus.orientation.shift_adjustment import Adjustment
 from zlocus.orientation.triangulate import Observations, rows_of_views
 from zlocus.sensors.line_shifts import LineShifts
 
-# Points of which it is computed at once which images see them, so that the memory for it stays small.
-POINTS_AT_ONCE = 4096
 # About so many ties of a pair (up to twice as many) are enough for the median distance that is reported.
 TIES_FOR_MEDIAN = 200
 
@@ -73,23 +71,37 @@ class PairOrientation:
     epipolar_distance_after_px: float
 
 
+def view_orientations(
+    views: Sequence[View],
+    adjustment: Adjustment,
+    corrected_sensors: Sequence[SensorModel],
+    line_shifts: Sequence[LineShifts | None],
+) -> tuple[ViewOrientation, ...]:
+    """Corrections and residuals of all views. corrected_sensors : their sensors, but for their shifts."""
+    rows = rows_of_views(adjustment.observations, len(views))
+    return tuple(
+        view_orientation(view, i, adjustment, rows[i], corrected_sensors[i], line_shifts[i])
+        for i, view in enumerate(views)
+    )
+
+
 def view_orientation(
     view: View,
     number: int,
     adjustment: Adjustment,
+    mine: NDArray[np.intp],
     corrected_sensor: SensorModel,
-    line_shifts: LineShifts | None = None,
+    line_shifts: LineShifts | None,
 ) -> ViewOrientation:
-    """Correction and residuals of the view of that number. corrected_sensor : its sensor, but for its shift."""
-    mine = adjustment.observations.view == number
+    """Correction and residuals of the view of that number. mine : (k,) rows of its observations."""
     column, row = adjustment.shift_px[number]
-    if corrected_sensor is not view.sensor and mine.any():
+    if corrected_sensor is not view.sensor and len(mine):
         xyz = adjustment.ground_points.xyz[adjustment.observations.point[mine]]
         moved = corrected_sensor.image_from_ground(xyz) - view.sensor.image_from_ground(xyz)
         column, row = np.nanmedian(moved, axis=0)
     before, after = Residuals.of(adjustment.before_px[mine]), Residuals.of(adjustment.after_px[mine])
     shift = (float(column), float(row))
-    return ViewOrientation(view.name, shift, int(mine.sum()), before, after, kind_of(view.sensor), line_shifts)
+    return ViewOrientation(view.name, shift, len(mine), before, after, kind_of(view.sensor), line_shifts)
 
 
 def pair_orientations(
@@ -123,13 +135,13 @@ def pair_orientations(
 
 def linked_pairs(observations: Observations, n_views: int, n_points: int) -> NDArray[np.int64]:
     """Numbers (k, 2) of the views, the smaller first, that see some point together."""
-    together = np.zeros((n_views, n_views), np.float32)
-    for first in range(0, n_points, POINTS_AT_ONCE):
-        here = (observations.point >= first) & (observations.point < first + POINTS_AT_ONCE)
-        sees = np.zeros((n_views, POINTS_AT_ONCE), np.float32)
-        sees[observations.view[here], observations.point[here] - first] = 1.0
-        together += sees @ sees.T
-    return np.argwhere(np.triu(together > 0, 1))
+    from scipy import sparse  # a tenth of a second
+
+    ones = np.ones(len(observations), np.float32)
+    sees = sparse.csr_array((ones, (observations.view, observations.point)), shape=(n_views, n_points))
+    together = sparse.triu(sees @ sees.T, 1).tocoo()
+    pairs = np.column_stack([together.row, together.col]).astype(np.int64)
+    return np.asarray(pairs[np.lexsort(pairs.T[::-1])])
 
 
 def median_distance(distance_px: FloatArray) -> float:

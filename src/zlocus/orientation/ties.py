@@ -96,17 +96,17 @@ def find_ties(
 
     def match_all(a: int) -> list[PairMatches]:
         """Match an image with all images after it, for which alone its sightlines are needed."""
-        others = np.flatnonzero(near[a, a + 1 :]) + a + 1
+        others = near[a][near[a] > a]
         if not len(others):
             return []
         lines = [Sightlines.of(scene.views[a].sensor, features[a].xy, z_range) for z_range in z_ranges]
         found = (match_pair(scene.views, features, (a, int(b)), lines, options) for b in others)
         return [matches for matches in found if len(matches)]
 
-    n_pairs, done = int(near.sum()) // 2, 0
+    n_pairs, done = sum(map(len, near)) // 2, 0
     for a, found in run_all(match_all, range(len(scene.views)), threads):
         pairs[a] = found
-        done += int(near[a, a + 1 :].sum())
+        done += int((near[a] > a).sum())
         report("matches", done / n_pairs if n_pairs else 1.0)
     every = tuple(pair for a in sorted(pairs) for pair in pairs[a])
     every += match_untied_images(scene.views, features, every, z_ranges, options)
@@ -168,31 +168,42 @@ def widest_range(views: Sequence[View]) -> tuple[float, float]:
     return min(low for low, _ in bounds), max(high for _, high in bounds)
 
 
-def neighbours(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> NDArray[np.bool_]:
-    """Whether two images may show the same ground, (i, i) bool; False for an image and itself.
+def neighbours(views: Sequence[View], z_range: tuple[float, float], margin_px: float) -> tuple[NDArray[np.int64], ...]:
+    """For each image the numbers of the other images that may show the same ground, in ascending order.
 
     z_range : heights of the ground, m; margin_px : largest pointing error of each image. Boxes around the footprints
-    are compared, so that some of the pairs show no common ground.
+    are compared, so that some of the pairs show no common ground. A spatial index finds them, so that the work does not
+    grow with the square of the number of images.
     """
-    low, high = np.moveaxis(np.array([ground_box(view, z_range, margin_px) for view in views]), 1, 0)
-    may = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
-    np.fill_diagonal(may, False)
-    return np.asarray(may)
+    from shapely import STRtree, box  # a tenth of a second
+
+    boxes = np.array([ground_box(view, z_range, margin_px) for view in views])
+    # An image without a finite box may show any ground.
+    is_finite = np.isfinite(boxes).all(axis=(1, 2))
+    numbers, unlimited = np.flatnonzero(is_finite), np.flatnonzero(~is_finite)
+    found = [np.arange(len(views)) if is_infinite else unlimited for is_infinite in ~is_finite]
+    outlines = box(*boxes[numbers].reshape(-1, 4).T)
+    first, second = STRtree(outlines).query(outlines)
+    ends = np.searchsorted(first, np.arange(len(numbers) + 1)) if (np.diff(first) >= 0).all() else None
+    assert ends is not None, "the index answers in the order of the questions"
+    for k, number in enumerate(numbers.tolist()):
+        found[number] = np.union1d(found[number], numbers[second[ends[k] : ends[k + 1]]])
+    return tuple(each[each != number] for number, each in enumerate(found))
 
 
 def shared_parts(
     views: Sequence[View],
     z_ranges: Sequence[tuple[float, float]],
     margin_px: float,
-    near: NDArray[np.bool_],
+    near: Sequence[NDArray[np.int64]],
 ) -> list[NDArray[np.bool_]]:
     """For each view the grid of its parts (see `sift.parts`), with those set that another view may show too.
 
-    near : (i, i) bool, see `neighbours`.
+    near : numbers of each view's neighbours, see `neighbours`.
     """
     wanted = [np.zeros(part_grid(held_window(view.image)[2:]), bool) for view in views]
     for i, view in enumerate(views):
-        others, every = [views[j] for j in np.flatnonzero(near[i]).tolist()], parts(view.image)
+        others, every = [views[j] for j in near[i].tolist()], parts(view.image)
         while some := dict(islice(every, PARTS_AT_ONCE)):
             for part in _seen_by(others, view, some, z_ranges, margin_px):
                 wanted[i][part] = True
@@ -211,8 +222,11 @@ def _seen_by(
     row, col, row_end, col_end = np.array(list(places.values())).T[:, :, None]
     y, x = np.broadcast_arrays((row + edge * (row_end - row))[:, :, None], (col + edge * (col_end - col))[:, None])
     xy = np.stack([x, y], axis=-1).reshape(-1, 2)
-    lines, seen = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges], set()
+    lines = [Sightlines.of(view.sensor, xy, z_range) for z_range in z_ranges]
+    seen: set[tuple[int, int]] = set()
     for other, line in product(other_views, lines):
+        if len(seen) == len(places):
+            break
         curves = epipolar_curves(line, other.sensor, line.z_range)
         for number, part in enumerate(places):
             if part not in seen:

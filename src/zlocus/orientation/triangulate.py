@@ -94,8 +94,13 @@ def project_points(sensors: Sequence[SensorModel], observations: Observations, x
 
 def rows_of_views(observations: Observations, n_views: int) -> list[NDArray[np.intp]]:
     """Row numbers of the observations of each view, in their order."""
-    order = np.argsort(observations.view, kind="stable")
-    return np.split(order, np.searchsorted(observations.view, np.arange(1, n_views), sorter=order))
+    return rows_by_view(observations.view, n_views)
+
+
+def rows_by_view(view: NDArray[np.int64], n_views: int) -> list[NDArray[np.intp]]:
+    """Numbers of the rows of each view, in their order. view : (m,) number of the view of each row."""
+    order = np.argsort(view, kind="stable")
+    return np.split(order, np.searchsorted(view, np.arange(1, n_views), sorter=order))
 
 
 def ground_jacobian(sensors: Sequence[SensorModel], observations: Observations, xyz: FloatArray) -> FloatArray:
