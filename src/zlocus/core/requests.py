@@ -179,6 +179,7 @@ class SetupRequest:
     dem_vertical: str | None = None
     vertical: str = "ellipsoid"
     reference: str | None = None
+    references: tuple[str, ...] = ()
     workers: int | None = None
     method: str = "mvll-sgm"
 

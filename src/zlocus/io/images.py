@@ -156,6 +156,19 @@ def open_image(path: Path) -> RasterImage:
     InputError
         There is no such file, it is a folder or no image, it is truncated, or its pixels are complex or of a palette.
     """
+    image = open_header(path)
+    check_last_block(image)
+    return image
+
+
+def open_header(path: Path) -> RasterImage:
+    """Open an image without reading any of its pixels: every block lies inside the file.
+
+    Raises
+    ------
+    InputError
+        See `open_image`.
+    """
     path = Path(path)
     state = file_state(path)
     with open_raster(path) as source:
@@ -178,10 +191,21 @@ def open_image(path: Path) -> RasterImage:
                 f"{path} holds no pixels: it is a sparse file of {image.shape[0]} x {image.shape[1]} px, and none of "
                 "its blocks was ever written. Copy it again from its source, or leave it out."
             )
-        image._read(source, _last_block(source, bands[0]))
         image = replace(image, held=held, state=tuple(state), sources=_sources(source, path))
         image = replace(image, decoded_bytes=whole_bytes(source, path))
         return replace(image, date=date_of_exposure(source), sun_direction=sun_direction_at_exposure(source))
+
+
+def check_last_block(image: RasterImage) -> None:
+    """Check that the last block of an image can be decoded.
+
+    Raises
+    ------
+    InputError
+        It cannot.
+    """
+    with open_raster(image.path) as source:
+        image._read(source, _last_block(source, image.bands[0]))
 
 
 def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:

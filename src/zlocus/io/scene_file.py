@@ -36,7 +36,14 @@ from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
 from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.crs import checked_crs, local_frame, utm_zone
-from zlocus.io.images import RasterImage, check_content, check_grey_values, open_image, with_plateau
+from zlocus.io.images import (
+    RasterImage,
+    check_content,
+    check_grey_values,
+    check_last_block,
+    open_header,
+    with_plateau,
+)
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_yaml
 from zlocus.io.safe_text import quoted
@@ -135,11 +142,12 @@ class SceneFile(StrictModel):
         return self
 
 
-def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
+def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[[Scene], Scene] | None = None) -> Scene:
     """Open the scene of some images with RPCs, or of one `scene.yaml`.
 
     crs : a projected CRS in metres, whose horizontal part becomes the frame. It overrides the CRS of the file. The
-    default is the WGS84 UTM zone of the scene's centre.
+    default is the WGS84 UTM zone of the scene's centre. chosen : for the scene of all views, of which only headers and
+    cameras have been read, it returns the scene of the views that are wanted. The pixels of the others are never read.
 
     Raises
     ------
@@ -155,7 +163,9 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None) -> Scene:
         given = f"only {opened[0].entry.path} was given" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
     frame = _default_crs(opened) if scene_input.crs is None else scene_input.crs
-    return scene_input.scene([each.view(frame) for each in opened], frame)
+    scene = scene_input.scene([each.view(frame) for each in opened], frame)
+    scene = scene if chosen is None else chosen(scene)
+    return replace(scene, views=tuple(map(_with_checked_image, scene.views)))
 
 
 @dataclass(frozen=True)
@@ -195,7 +205,9 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
             return []
 
     opened = [
-        each for entry in scene_input.entries for each in attempt(entry, partial(_open_view, entry, scene_input.folder))
+        each
+        for entry in scene_input.entries
+        for each in attempt(entry, partial(_open_checked_view, entry, scene_input.folder))
     ]
     frame = scene_input.crs
     if frame is None:
@@ -322,11 +334,29 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[Refu
 
 
 def _open_view(entry: _ResolvedEntry, folder: Path) -> _OpenedView:
-    image = open_image(entry.path)
+    """A view of which only the header and the camera have been read."""
+    image = open_header(entry.path)
+    return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
+
+
+def _open_checked_view(entry: _ResolvedEntry, folder: Path) -> _OpenedView:
+    """A view whose pixels have been checked."""
+    image = _checked(open_header(entry.path))
+    return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
+
+
+def _checked(image: RasterImage) -> RasterImage:
+    """The image after the checks of its pixels, without a plateau at its border."""
+    check_last_block(image)
     check_grey_values(image)
     check_content(image)
-    image = with_plateau(image)
-    return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
+    return with_plateau(image)
+
+
+def _with_checked_image(view: View) -> View:
+    """See `_checked`."""
+    assert isinstance(view.image, RasterImage), "it was opened here"
+    return replace(view, image=_checked(view.image))
 
 
 def _from_scene_file(path: Path, crs: CRS | None, refused: list[RefusedView] | None) -> _SceneInput:

@@ -12,7 +12,7 @@ Matching in image space needs no grid: `zlocus.pipeline.image_tiles` replaces th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,11 +25,20 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import ConfigError, CoverageError, GeometryError
-from zlocus.core.footprints import area_to_match, check_overlap, ground_sample_distance
+from zlocus.core.footprints import (
+    Bounds,
+    area_not_seen,
+    area_to_match,
+    check_overlap,
+    ground_sample_distance,
+    shared_ground,
+    views_near,
+)
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
 from zlocus.core.progress import Progress
+from zlocus.core.request_checks import is_scene_file
 from zlocus.core.requests import SetupRequest
 from zlocus.core.resources import cores
 from zlocus.core.scene import Scene, is_local
@@ -103,11 +112,15 @@ def open_inputs(request: SetupRequest, progress: Progress, overlap_check: Overla
     """
     like = read_geobox(request.like) if request.like else None
     datum = named_vertical_datum(request.vertical)
-    scene = open_scene(request.inputs, requested_crs(request.crs) if like is None else _crs_of(like))
-    if is_local(scene.crs):
-        _refuse_maps_in_local_frame(request)
     bounds = request.bounds if like is None else like.boundingbox.bbox
-    scene = sorted_views(with_heights(scene, request.heights, datum, bounds))
+
+    def chosen(scene: Scene) -> Scene:
+        if is_local(scene.crs):
+            _refuse_maps_in_local_frame(request)
+        scene = sorted_views(with_heights(scene, request.heights, datum, bounds))
+        return views_of_area(scene, bounds or scene.bounds, (request.reference, *request.references), progress)
+
+    scene = open_scene(request.inputs, requested_crs(request.crs) if like is None else _crs_of(like), chosen)
     is_unknown = is_local(scene.crs) and scene.heights is None
     if overlap_check == "always" or (overlap_check == "unless local" and not is_unknown):
         check_overlap(scene, possible_heights(scene, scene.heights))
@@ -134,6 +147,36 @@ def requested_crs(text: str | None) -> CRS | None:
 def sorted_views(scene: Scene) -> Scene:
     """The scene with its views sorted by name, so that the order of the inputs changes nothing."""
     return replace(scene, views=tuple(sorted(scene.views, key=lambda view: view.name)))
+
+
+def views_of_area(scene: Scene, area: Bounds | None, always: Sequence[str | None], progress: Progress) -> Scene:
+    """The scene of the views that may show the area that is asked for, so that the others are not read at all.
+
+    area : bounds in the frame of the scene, m; None is all of it; always : names of views that stay whatever they show.
+    All views stay in a local frame, and where nothing tells at which heights the ground may be.
+
+    Raises
+    ------
+    GeometryError
+        Fewer than two views may show the area.
+    """
+    if area is None or is_local(scene.crs):
+        return scene
+    try:
+        heights = possible_heights(scene, scene.heights)
+    except GeometryError:  # a later check says so, where heights are needed
+        return scene
+    z_range = heights[0], heights[-1]
+    near = {view.name for view in views_near(scene.views, area, z_range)}
+    if len(near) < MIN_VIEWS:
+        raise area_not_seen(area, shared_ground(scene, z_range), "--bounds, --like")
+    views = tuple(view for view in scene.views if view.name in near or view.name in always)
+    if len(views) < len(scene.views):
+        progress.note(
+            f"{len(views)} of {len(scene.views)} images may show the area asked for. The pixels of the others are not "
+            "read."
+        )
+    return replace(scene, views=views)
 
 
 def orient_views(
@@ -354,4 +397,7 @@ def _files_read(request: SetupRequest, scene: Scene, vertical_datum: VerticalDat
     extra += vertical_datum.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
-    return list(dict.fromkeys([*request.inputs, *files_of(scene), *extra]))
+    read = files_of(scene)
+    # Images on the command line that show nothing of the area are not read.
+    given = [path for path in request.inputs if is_scene_file(path) or path in read]
+    return list(dict.fromkeys([*given, *read, *extra]))

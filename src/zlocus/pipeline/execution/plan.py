@@ -47,8 +47,8 @@ def plan_tiles(requested_window: CellWindow, overlap_window: CellWindow, options
     """The tiles that contain the requested cells, row by row.
 
     requested_window, overlap_window : finest cells. Cores are equal parts of the overlap of views, which is a property
-    of the scene; so the height of a cell does not depend on the requested area. Cells outside the overlap belong to
-    tiles of the same size without a core.
+    of the views that take part; among equal views the height of a cell does not depend on the requested area. Cells
+    outside the overlap belong to tiles of the same size without a core.
     """
     height, width = core_size(overlap_window, options)
     first_row, first_col = (
