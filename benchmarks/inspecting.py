@@ -23,7 +23,7 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window
 
-import scaling
+import large
 from workplace import ZLOCUS, CannotRun, Figure, Workplace, ended, run
 
 N_CLICKS, N_TILES = 60, 200
@@ -52,7 +52,7 @@ def inspect(workplace: Workplace) -> list[Figure]:
 def inspect_large(workplace: Workplace) -> list[Figure]:
     """Response times on a surface of 100 million cells."""
     with tempfile.TemporaryDirectory(dir=workplace.out.parent) as scratch:
-        images = scaling.write_views(Path(scratch), scaling.town(), 6, round((LARGE_M * 1e6) ** 0.5))
+        images = large.write_views(Path(scratch), large.town(), 6, round((LARGE_M * 1e6) ** 0.5))
         run([ZLOCUS, "dsm", *images, "-o", workplace.out, "--crs", "EPSG:32632", "--resolution", 0.5, "--overwrite"])
         return measured(workplace.out, LARGE_MS)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-import scaling
+import large
 from workplace import ZLOCUS, Figure, Workplace, rendered_images, run
 
 # Cells of overlap of a tile with its neighbours: by default, and in the comparison.
@@ -32,7 +32,7 @@ def halo(workplace: Workplace) -> list[Figure]:
     """Share of the cells of two towns that change when the halo is wider."""
     small = workplace.scene("rendered-city")
     with tempfile.TemporaryDirectory(dir=workplace.out.parent) as scratch:
-        town = scaling.write_views(Path(scratch), scaling.town(), 6, HALO_TOWN_PX)
+        town = large.write_views(Path(scratch), large.town(), 6, HALO_TOWN_PX)
         options = ["--crs", "EPSG:32632", *map(str, town)]
         return [
             *changes(workplace, options, None, {"twice": WIDER["twice"]}),
@@ -50,7 +50,7 @@ def changes(
         options.parent.mkdir(parents=True, exist_ok=True)
         options.write_text(f"[pyramid]\nhalo = {cells}\n" + (f"tile = {tile}\n" if tile else ""))
         run([ZLOCUS, "dsm", *images, "-o", out, "--resolution", 0.5, "--config", options, "--overwrite", "--no-report"])
-        heights[cells], step_m = heights_of(out), scaling.record_of(out)["heights"]["step_m"]
+        heights[cells], step_m = heights_of(out), large.record_of(out)["heights"]["step_m"]
     of = f"tiles of {tile}" if tile else "usual tiles"
     return [
         Figure(f"{of}, changed by a halo {name} as wide", changed(heights[USUAL_HALO], heights[cells], step_m),
@@ -74,18 +74,18 @@ def heights_of(out: Path) -> np.ndarray:
 
 
 def growth(
-    workplace: Workplace, usual_m: float = USUAL_M, large_m: float = LARGE_M, period_px: int = scaling.PERIOD_PX
+    workplace: Workplace, usual_m: float = USUAL_M, large_m: float = LARGE_M, period_px: int = large.PERIOD_PX
 ) -> list[Figure]:
     """Cost of 100 million cells of six images compared with 4 million, and of two workers compared with one.
 
     usual_m, large_m : size of the two areas in millions of cells; period_px : side of the town that is repeated.
     """
-    town, rows = scaling.town(period_px), {}
+    town, rows = large.town(period_px), {}
     with tempfile.TemporaryDirectory(dir=workplace.out.parent) as scratch:
         for million in (usual_m, large_m):
-            images = scaling.write_views(Path(scratch), town, 6, round((million * 1e6) ** 0.5))
+            images = large.write_views(Path(scratch), town, 6, round((million * 1e6) ** 0.5))
             for workers in (1, 2):
-                rows[million, workers] = scaling.measured(images, Path(scratch) / "out", workers, 2 * MAX_WORKER_GB)
+                rows[million, workers] = large.measured(images, Path(scratch) / "out", workers, 2 * MAX_WORKER_GB)
     one, two, usual = rows[large_m, 1], rows[large_m, 2], rows[usual_m, 2]
     return [
         Figure("million cells", two.million),

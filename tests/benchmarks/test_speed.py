@@ -14,10 +14,10 @@ import rasterio
 
 import bench_kernels
 import inspecting
+import large
 import machine
 import roofline
 import roofline_counts
-import scaling
 import threads
 from benchmark_scripts import printed_table, run_script, share_of
 from rows import large_areas, resources
@@ -33,23 +33,23 @@ LEAST_RATE, MOST_RATE = 0.02, 5000.0
 
 @pytest.fixture(scope="module")
 def repeated_town():
-    return scaling.town(PERIOD_PX)
+    return large.town(PERIOD_PX)
 
 
 def test_images_of_the_repeated_town_are_repeated(repeated_town, tmp_path):
     """In their pixels, and in what their RPCs say of the ground."""
     side = 2 * PERIOD_PX + 10
-    paths = scaling.write_views(tmp_path, repeated_town, 2, side)
+    paths = large.write_views(tmp_path, repeated_town, 2, side)
     for number, path in enumerate(paths):
         with rasterio.open(path) as file:
             grey = file.read(1)
         assert grey.shape == (side, side)
-        shown = scaling.pixels(repeated_town, scaling.LOOKS[number], number)
+        shown = large.pixels(repeated_town, large.LOOKS[number], number)
         np.testing.assert_array_equal(grey[:PERIOD_PX, :PERIOD_PX], shown)
         np.testing.assert_array_equal(grey[:PERIOD_PX, :PERIOD_PX], grey[PERIOD_PX:-10, PERIOD_PX:-10])
         assert grey.std() > 20
     west, north, z = repeated_town.west_m, repeated_town.north_m, repeated_town.z[0]
-    step_m = PERIOD_PX * scaling.GSD_M
+    step_m = PERIOD_PX * large.GSD_M
     xyz = np.array([[west + 5, north - 5, z], [west + 5 + step_m, north - 5 - step_m, z]])
     for view in open_scene(paths).views:
         first, second = view.sensor.image_from_ground(xyz)
@@ -59,16 +59,16 @@ def test_images_of_the_repeated_town_are_repeated(repeated_town, tmp_path):
 def test_images_of_a_block_show_the_same_ground(repeated_town, tmp_path):
     """Neighbours overlap by half, and a ground point has the grey value of its image in the whole town."""
     half = PERIOD_PX // 2
-    paths = scaling.write_block(tmp_path, repeated_town, 2)
+    paths = large.write_block(tmp_path, repeated_town, 2)
     assert [path.name for path in paths] == ["b00_00.tif", "b00_01.tif", "b01_00.tif", "b01_01.tif"]
-    step_m, middle_m = half * scaling.GSD_M, sum(repeated_town.z) / 2
+    step_m, middle_m = half * large.GSD_M, sum(repeated_town.z) / 2
     middle = np.array([[repeated_town.west_m + 1.5 * step_m, repeated_town.north_m - 1.5 * step_m, middle_m]])
     for view, (row, col) in zip(open_scene(paths).views, ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
         ((x, y),) = view.sensor.image_from_ground(middle)
         # Whatever their direction, images of a point at the middle height lie side by side, half a period apart.
         assert x == pytest.approx((1.5 - col) * half - 0.5, abs=PERIOD_TOLERANCE_PX)
         assert y == pytest.approx((1.5 - row) * half - 0.5, abs=PERIOD_TOLERANCE_PX)
-    whole = scaling.pixels(repeated_town, scaling.LOOKS[1], 1)
+    whole = large.pixels(repeated_town, large.LOOKS[1], 1)
     with rasterio.open(paths[1]) as file:
         np.testing.assert_array_equal(file.read(1)[:, :half], whole[:, half:])
 
@@ -77,7 +77,7 @@ def test_growth_is_measured_and_kept(tmp_path, monkeypatch, capfd):
     table = tmp_path / "growth.csv"
     table.write_text("what,million\narea,1\nviews,2\n")
     asked = ["--million", 0.012, "--period", PERIOD_PX, "--workers", 1, "--table", table, "--scratch", tmp_path]
-    run_script(monkeypatch, scaling, "views", "--images", 3, *asked)
+    run_script(monkeypatch, large, "views", "--images", 3, *asked)
     (row,) = printed_table(capfd.readouterr().out)
     # Rows of another kind stay, those of this kind are replaced.
     with table.open(newline="") as file:
@@ -93,22 +93,22 @@ def test_growth_is_measured_and_kept(tmp_path, monkeypatch, capfd):
     assert 100 < float(found["worker_mb"]) < 4000
     assert 100 < float(found["command_mb"]) < 4000
     assert 0.5 < float(found["filled"]) <= 1
-    assert not list(tmp_path.glob("scaling-*"))
+    assert not list(tmp_path.glob("large-*"))
 
 
 def test_kept_growth_is_drawn(tmp_path, monkeypatch):
     """That of the documents, from the table beside the script."""
-    run_script(monkeypatch, scaling, "draw", "--picture", tmp_path / "growth.png")
+    run_script(monkeypatch, large, "draw", "--picture", tmp_path / "growth.png")
     assert (tmp_path / "growth.png").stat().st_size > 10_000
-    (tmp_path / "growth.csv").write_text(scaling.KEPT.read_text().replace("\nblock,", "\nviews,"))
+    (tmp_path / "growth.csv").write_text(large.KEPT.read_text().replace("\nblock,", "\nviews,"))
     with pytest.raises(CannotRun, match=f"`{tmp_path}/growth.csv` has no rows of `block`: measure them first"):
-        run_script(monkeypatch, scaling, "draw", "--picture", tmp_path / "x.png", "--table", tmp_path / "growth.csv")
+        run_script(monkeypatch, large, "draw", "--picture", tmp_path / "x.png", "--table", tmp_path / "growth.csv")
 
 
-def growth_of(million, workers) -> scaling.Growth:
+def growth_of(million, workers) -> large.Growth:
     """Of a program that takes 10 s of CPU a million cells, 8 s of them to match; two workers are 1.5 times as fast."""
     wall = 10 * million / (1.5 if workers == 2 else 1)
-    return scaling.Growth(million, 6, workers, 1, wall, 1.0, wall / 2, 1.0, 8 * million, 10 * million, 1500.0, 500.0, 1)
+    return large.Growth(million, 6, workers, 1, wall, 1.0, wall / 2, 1.0, 8 * million, 10 * million, 1500.0, 500.0, 1)
 
 
 def test_growth_of_the_acceptance_table(tmp_path, monkeypatch):
@@ -119,8 +119,8 @@ def test_growth_of_the_acceptance_table(tmp_path, monkeypatch):
         sides.append((len(images), images[0], workers))
         return growth_of(images[0] ** 2 / 1e6, workers)
 
-    monkeypatch.setattr(scaling, "write_views", lambda folder, town, n_views, side: n_views * [side])
-    monkeypatch.setattr(scaling, "measured", measured)
+    monkeypatch.setattr(large, "write_views", lambda folder, town, n_views, side: n_views * [side])
+    monkeypatch.setattr(large, "measured", measured)
     at = Workplace(None, tmp_path / "growth")
     figures = {figure.what: figure for figure in large_areas.growth(at, 0.01, 0.04, PERIOD_PX)}
     assert sides == [(6, 100, 1), (6, 100, 2), (6, 200, 1), (6, 200, 2)]

@@ -1,16 +1,17 @@
 """Growth of time and memory with area, number of images and workers, on a rendered town that is repeated as needed.
 
-    python benchmarks/scaling.py area --million 4 16 100
-    python benchmarks/scaling.py workers --million 16
-    python benchmarks/scaling.py views --million 1 --images 2 4 8
-    python benchmarks/scaling.py block --side 4 8 16
-    python benchmarks/scaling.py draw [--picture FILE]
+    python benchmarks/large.py area --million 4 16 100
+    python benchmarks/large.py workers --million 16
+    python benchmarks/large.py views --million 1 --images 2 4 8
+    python benchmarks/large.py block --side 4 8 16
+    python benchmarks/large.py frames --frames 100 300 1000
+    python benchmarks/large.py draw [--picture FILE]
 
 One period of the town is rendered per image by a parallel camera, so that the image of the repeated town is
 the repeated image. CPU is the CPU of all processes, from `run.json`; memory is the largest memory of one worker, from
 `events.jsonl`. Measured rows replace rows of the same kind in `growth.csv`, or in the table that `--table` names.
 `draw` plots them as docs/development/experiments/growth.png. `--period` sets the side of the town and of the images of
-a block.
+a block. `frames` plans whole blocks of frames, matches a part of each (`frame_block.py`), and prints tables.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 from rasterio.windows import Window
 
+from frame_block import Survey, measure_frames
 from workplace import CannotRun, ended
 from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.sensors.rpc_fit import fit_rpc
@@ -57,6 +59,8 @@ BLOCK = 256
 # View angles along and across, degrees: the first image is vertical, the others come in pairs from all sides.
 LOOKS = (1.0, -1.0), (16.0, 2.0), (-16.0, -2.0), (8.0, 12.0), (-8.0, -12.0), (4.0, -18.0)
 IMAGES = (2, 4, 8, 16, 32, 64)
+# Frames of whole blocks, and side of the part of each that is matched, m.
+FRAMES, PART_M = (100, 300, 1000), 500.0
 
 
 @dataclass(frozen=True)
@@ -323,10 +327,13 @@ def plans(asked: argparse.Namespace) -> Iterator[tuple[int, int, int]]:
 def main() -> None:
     """Measure the runs that the command line names, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("area", "workers", "views", "block", "draw"))
+    parser.add_argument("what", choices=("area", "workers", "views", "block", "frames", "draw"))
     parser.add_argument("--million", type=float, nargs="+", default=[4.0], help="cells")
     parser.add_argument("--side", type=int, nargs="+", default=[4, 8], help="images along each side of a block")
     parser.add_argument("--images", type=int, nargs="+", default=IMAGES, help="numbers of images, for views")
+    parser.add_argument("--frames", type=int, nargs="+", default=FRAMES, help="numbers of frames, for frames")
+    parser.add_argument("--part", type=float, default=PART_M, metavar="M", help="side of the part that is matched")
+    parser.add_argument("--enlarged", type=int, default=1, metavar="N", help="enlarge frames by this after rendering")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--memory", type=float, default=8.0, help="GB of all workers together")
     parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()), help="images and surfaces")
@@ -337,9 +344,13 @@ def main() -> None:
     if asked.what == "draw":
         draw(asked.picture, asked.table)
         return
-    folder = Path(tempfile.mkdtemp(prefix="scaling-", dir=asked.scratch))
+    folder = Path(tempfile.mkdtemp(prefix="large-", dir=asked.scratch))
     try:
         at, made, found = town(asked.period), {}, []
+        if asked.what == "frames":
+            survey = Survey(at.ground, at.west_m, at.north_m, GSD_M, at.period_px, asked.enlarged)
+            measure_frames(folder, survey, asked.frames, asked.part, asked.workers)
+            return
         print(HEAD, flush=True)
         for side, n, workers in plans(asked):
             if (side, n) not in made:
