@@ -97,3 +97,15 @@ def test_close_cameras_are_chosen_for_each_point_of_a_tile():
     assert n_showing[is_core].min() >= options.max_images_of_point
     assert n_showing[~is_core].min() >= IMAGES_OF_HALO
     assert len(chosen_views) < len(views) * 0.7
+
+
+def test_a_tile_may_be_shown_by_more_images_than_a_block_compares():
+    """300 images of a drone, each of a part of a tile: more than the option `max_candidates` may ask for."""
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    easts = np.linspace(-60.0, 60.0, 300)
+    sensors = [FrameModel((CENTRE[0] + e, CENTRE[1], Z + 30.0), turn, 90.0, (60.0, 50.0)) for e in easts]
+    views = [View(f"v{k}", Path("x"), Blank(), one) for k, one in enumerate(sensors)]
+    east, north = (a.ravel() for a in np.meshgrid(np.linspace(-50, 50, 21), np.linspace(-6, 6, 5)))
+    ground = np.column_stack([CENTRE[0] + east, CENTRE[1] + north])
+    found = preselected(views, ground, Z, SelectionOptions(), np.ones(len(ground), bool))
+    assert 6 < len(found) < 200

@@ -249,6 +249,14 @@ def closeness(angle_deg: FloatArray, options: SelectionOptions) -> FloatArray:
 def candidate_images(geometry: SearchGeometry, options: SelectionOptions) -> IntArray:
     """Search images to be considered for a block, best first, at most `max_candidates` of them. (j,) int64.
 
+    See `ranked_images` for their order.
+    """
+    return ranked_images(geometry, options)[: options.max_candidates]
+
+
+def ranked_images(geometry: SearchGeometry, options: SelectionOptions) -> IntArray:
+    """All search images that may be considered for a block, best first. (j,) int64.
+
     The value of an image is its overlap times the `closeness` of its angle times 1/2 for every `half_days` between the
     dates; an unknown date counts as the farthest known one. Images outside the limits of overlap and angle follow after
     all others, so that a block without better ones still has candidates. Images that see nothing of the block, or look
@@ -262,4 +270,4 @@ def candidate_images(geometry: SearchGeometry, options: SelectionOptions) -> Int
     is_outside = (overlap < options.min_overlap) | (angle < options.min_angle_deg) | (angle > options.max_angle_deg)
     best_first = np.lexsort((-value, is_outside))
     is_possible = (overlap > 0) & (angle > 0)
-    return best_first[is_possible[best_first]][: options.max_candidates].astype(np.int64)
+    return best_first[is_possible[best_first]].astype(np.int64)

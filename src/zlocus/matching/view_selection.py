@@ -12,7 +12,7 @@ Heights are slope indices, except in the match curves of the coarser level (see 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,14 @@ from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.view_directions import cells_per_step
-from zlocus.matching.view_ranking import FeaturePoints, SearchGeometry, candidate_images, closeness, order_images
+from zlocus.matching.view_ranking import (
+    FeaturePoints,
+    SearchGeometry,
+    candidate_images,
+    closeness,
+    order_images,
+    ranked_images,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -160,7 +167,7 @@ def preselected(
     if is_core is None:
         candidates = candidate_images(search_geometry, options)
     else:
-        best_first = candidate_images(search_geometry, replace(options, max_candidates=len(views)))
+        best_first = ranked_images(search_geometry, options)
         n_wanted = np.where(is_core, options.max_images_of_point, min(options.max_images_of_point, IMAGES_OF_HALO))
         candidates = candidates_of_points(best_first, inside, n_wanted)[:MAX_VIEWS]
     return sorted([reference, *candidates.tolist()])
