@@ -20,6 +20,7 @@ from pathlib import Path
 
 from result_files import code_of, record_results
 from rows.registry import ROWS
+from rows.resources import peaks_by_plan
 from workplace import CannotRun, Figure, Workplace
 
 
@@ -56,10 +57,13 @@ def main() -> int:
 
 
 def measured(name: str, out: Path, is_recorded: bool) -> list[Figure]:
-    """Measure a row in the folder `out`, and write its results file if that is asked for."""
+    """Measure a row in the folder `out`, and write its results file if that is asked for.
+
+    To its own figures are added how far the memory of its runs is from their plans.
+    """
     row, data = ROWS[name], os.environ.get("ZLOCUS_TEST_DATA")
     workplace, code, start = Workplace(Path(data) if data else None, out), code_of(row.parts), time.monotonic()
-    figures = row.measure(workplace)
+    figures = [*row.measure(workplace), *peaks_by_plan(out)]
     if is_recorded and row.is_recorded:
         seconds, command = time.monotonic() - start, f"make measure ROW={name}"
         record_results(name, figures, command, seconds=seconds, code=code, inputs=workplace.inputs)

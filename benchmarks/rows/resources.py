@@ -24,6 +24,8 @@ SPEED_SIDE_CELLS, SPEED_SEED = 2048, 12
 SPEED_BARS_S = {"six": 8.0, "three": 4.0}
 # Cells along a side of a town whose images have about 300 x 300 pixels, and how often its surface is made.
 SMALL_SIDE_CELLS, N_SMALL_RUNS = 280, 9
+# Bounds of the peak memory of a run as a share of what it had planned.
+LEAST_BY_PLAN, MOST_BY_PLAN = 0.75, 1.25
 # Signals in the row `signals`; the tests send fewer of them.
 N_SIGNALS = 30
 
@@ -95,6 +97,31 @@ def of_all_processes(record: dict[str, Any], at_most_gb: float | None = None) ->
             fails_when="a stage holds whole images or rasters instead of tiles",
         ),
     ]  # fmt: skip
+
+
+def peaks_by_plan(folder: Path) -> list[Figure]:
+    """The largest memory of a process divided by what its run had planned: least and largest of the runs in a folder.
+
+    Runs of the cluster are not counted, nor those of other programs and earlier versions, whose records hold no plan.
+    """
+    records = [json.loads(path.read_text()) for path in sorted(folder.rglob("run.json"))]
+    shares = [
+        max(stage["peak_mb"] for stage in record["stages"]) / record["plan"]["process_mb"]
+        for record in records
+        if "plan" in record and not record["config"]["request"].get("scheduler")
+    ]
+    if not shares:
+        return []
+    why = "arrays are made that the plan does not count, or kept longer than needed"
+    return [
+        Figure(
+            "peak memory by its plan, least",
+            min(shares),
+            at_least=LEAST_BY_PLAN,
+            fails_when="a plan counts memory that no tile takes",
+        ),
+        Figure("peak memory by its plan, largest", max(shares), at_most=MOST_BY_PLAN, fails_when=why),
+    ]
 
 
 def speed(workplace: Workplace) -> list[Figure]:

@@ -26,7 +26,7 @@ import middlebury
 import reprojection
 import workplace
 from benchmark_scripts import DISPARITY_PX, printed_table, run_script, write_photographs
-from rows import other_programs, rendered
+from rows import other_programs, rendered, resources
 from workplace import CannotRun, Figure, Workplace
 from zlocus.sensors.frame import FrameModel
 
@@ -65,7 +65,8 @@ def test_a_row_of_the_acceptance_table(small_data, tmp_path, monkeypatch, capsys
     assert run_script(monkeypatch, acceptance, "city", "--keep", tmp_path / "kept") == 0
     figures = table_of(capsys.readouterr().out)
     plain = [*(f"within 1 m: {kind}" for kind in ("all", "ground", "building", "tree")), "NMAD ground"]
-    assert list(figures) == [*plain, *(f"aligned, {what}" for what in plain)]
+    of_memory = [f"peak memory by its plan, {which}" for which in ("least", "largest")]
+    assert list(figures) == [*plain, *(f"aligned, {what}" for what in plain), *of_memory]
     for name, (figure, bar, verdict) in figures.items():
         value = float(figure.split()[0])
         if "within" in name:
@@ -80,6 +81,22 @@ def test_a_row_of_the_acceptance_table(small_data, tmp_path, monkeypatch, capsys
     found = judging.judged(dsm, scene / "truth_dsm.tif", scene / "truth_class.tif")
     for kind in ("all", "ground", "building", "tree"):
         assert found[kind]["within"] == pytest.approx(float(figures[f"within 1 m: {kind}"][0]), abs=ROUNDED)
+
+
+def test_the_memory_of_runs_is_held_against_their_plans(tmp_path):
+    """By the process that takes most; records of other programs hold no plan."""
+    request = {"config": {"request": {"scheduler": None}}}
+    for name, peaks_mb, plan_mb in (("one", (200.0, 900.0), 1000.0), ("deep/two", (1300.0, 100.0), 1000.0)):
+        (tmp_path / name).mkdir(parents=True)
+        stages = [{"name": "match", "peak_mb": peak} for peak in peaks_mb]
+        record = request | {"stages": stages, "plan": {"process_mb": plan_mb, "memory_mb": 3000.0}}
+        (tmp_path / name / "run.json").write_text(json.dumps(record))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "run.json").write_text(json.dumps({"stages": []}))
+    least, largest = resources.peaks_by_plan(tmp_path)
+    assert (least.value, least.passes) == (0.9, True)
+    assert (largest.value, largest.passes) == (1.3, False)
+    assert resources.peaks_by_plan(tmp_path / "other") == []
 
 
 def test_a_row_that_cannot_be_run_says_why(monkeypatch, capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 DEFAULT_MEMORY_SHARE = 0.6
 # Memory that the first tile adds to a process beside its own: compiled kernels and GDAL's block cache. And the memory
 # of a worker before its first tile, Python and libraries included.
-TILE_CODE_BYTES, WORKER_BYTES = 160e6, 280e6
+TILE_CODE_BYTES, WORKER_BYTES = 80e6, 280e6
 CGROUP = Path("/sys/fs/cgroup")
 STATUS = Path("/proc/self/status")
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
-from zlocus.core.sensor_model import lowest_station
 from zlocus.matching.cost_volume import CountedPairs, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
@@ -32,7 +31,6 @@ from zlocus.matching.level_records import (
     PyramidLevel,
     SearchPrior,
     TileInputs,
-    level_window,
 )
 from zlocus.matching.local_contrast import agreement
 from zlocus.matching.match_scene import MatchScene
@@ -66,9 +64,9 @@ from zlocus.matching.semiglobal import (
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
 from zlocus.matching.surface import Surface
+from zlocus.matching.tile_candidates import candidates_of_tile, windows_of
 from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
-from zlocus.matching.view_pixels import PixelWindow, window_showing
-from zlocus.matching.view_selection import ChosenViews, choose_views, preselected
+from zlocus.matching.view_selection import ChosenViews, choose_views
 
 
 @dataclass(frozen=True)
@@ -160,50 +158,10 @@ def tile_inputs(
     preselect: bool = True,
 ) -> TileInputs:
     """The views that may see a tile; with `preselect`, of many views only the best candidates."""
-    ground_xy, windows = windows_of(match_scene, core_window, config)
-    numbers = list(windows)
+    numbers = list(windows_of(match_scene, core_window, config))
     if preselect:
-        numbers = candidates_of_tile(match_scene, core_window, ground_xy, numbers, config)
+        numbers = candidates_of_tile(match_scene, core_window, numbers, config)
     return TileInputs(match_scene, core_window, config, numbers, method, choose_images)
-
-
-def candidates_of_tile(
-    match_scene: MatchScene,
-    core_window: CellWindow,
-    ground_xy: NDArray[np.float64],
-    numbers: list[int],
-    config: RunConfig,
-) -> list[int]:
-    """The best candidates of the views with some numbers, ascending, see `preselected`; all where they are not many.
-
-    ground_xy : (n, 2) m, points all over the tile with its halo.
-    """
-    views, is_core, most = [match_scene.views[n] for n in numbers], None, config.selection.max_candidates
-    if lowest_station(view.sensor for view in views) is not None:
-        is_core, most = match_scene.are_in(core_window, ground_xy), config.selection.max_images_of_point
-    if len(views) <= most + 1:
-        return numbers
-    rows = preselected(views, ground_xy, match_scene.ground_height, config.selection, is_core)
-    return [numbers[row] for row in rows]
-
-
-def windows_of(
-    match_scene: MatchScene, core_window: CellWindow, config: RunConfig
-) -> tuple[NDArray[np.float64], dict[int, PixelWindow]]:
-    """Where the views see a tile.
-
-    Ground points (n, 2) m all over the tile with its halo, and the window (row, col, rows, cols) px of each view that
-    may see it, by its number in the scene.
-    """
-    coarsest, options = match_scene.levels - 1, config.pyramid
-    limit_window = match_scene.overlap_window.at_level(coarsest, 0)
-    window = level_window(core_window, coarsest, options.halo, options.block, limit_window)
-    ground_xy, windows = match_scene.points_of(window, coarsest), {}
-    for number in match_scene.views_near(ground_xy):
-        view_window = window_showing(match_scene.views[number], ground_xy, match_scene.z_range, coarsest)
-        if view_window is not None:
-            windows[number] = view_window
-    return ground_xy, windows
 
 
 def rank_tile(match_scene: MatchScene, core_window: CellWindow, config: RunConfig) -> TileLabels | None:

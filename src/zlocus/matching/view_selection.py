@@ -146,16 +146,18 @@ def preselected(
     z: float,
     options: SelectionOptions,
     is_core: NDArray[np.bool_] | None = None,
+    other_heights: Sequence[float] = (),
 ) -> list[int]:
     """Numbers of the views to read for a patch of ground, ascending: a reference image and its best candidates.
 
     views : in the order in which they may be the reference; ground_xy : (n, 2) m, a grid of points over the patch; z :
     m. Of a scene of hundreds of images few see the patch, and fewer are worth a comparison; see `candidate_images`.
     is_core : (n,), points of the core of a tile. Given for close cameras, each of which shows a part of the patch: not
-    the patch has a number of candidates then but each of its points, see `candidates_of_points`.
+    the patch has a number of candidates then but each of its points, see `candidates_of_points`, at z and at the
+    `other_heights`, m.
     """
     xyz = np.column_stack([ground_xy, np.full(len(ground_xy), z)])
-    inside = np.array([_inside(view, xyz) for view in views])
+    inside = _insides(views, ground_xy, z)
     overlap = inside.mean(axis=1)
     shows_all = overlap >= MIN_SHARE_OF_REFERENCE
     reference = int(np.argmax(shows_all)) if shows_all.any() else int(overlap.argmax())
@@ -169,7 +171,9 @@ def preselected(
     else:
         best_first = ranked_images(search_geometry, options)
         n_wanted = np.where(is_core, options.max_images_of_point, min(options.max_images_of_point, IMAGES_OF_HALO))
-        candidates = candidates_of_points(best_first, inside, n_wanted)[:MAX_VIEWS]
+        at_heights = [inside, *(_insides(views, ground_xy, height) for height in other_heights)]
+        n_wanted = np.tile(n_wanted, len(at_heights))
+        candidates = candidates_of_points(best_first, np.concatenate(at_heights, axis=1), n_wanted)[:MAX_VIEWS]
     return sorted([reference, *candidates.tolist()])
 
 
@@ -192,6 +196,12 @@ def _parallax_rate_at(view: View, xyz: FloatArray, z: float) -> FloatArray:
     return parallax_rate(
         view, z, view.sensor.image_from_ground(xyz.mean(axis=0, keepdims=True))[0] if len(xyz) else None
     )
+
+
+def _insides(views: Sequence[View], ground_xy: FloatArray, z: float) -> NDArray[np.bool_]:
+    """Which ground points (n, 2) m of a height fall inside each image, (i, n) bool."""
+    xyz = np.column_stack([ground_xy, np.full(len(ground_xy), z)])
+    return np.array([_inside(view, xyz) for view in views])
 
 
 def _inside(view: View, xyz: FloatArray) -> NDArray[np.bool_]:

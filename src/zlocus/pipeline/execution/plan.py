@@ -16,7 +16,7 @@ from zlocus.core.scene import DecodedSource, View
 from zlocus.io.decoded_images import DECODED, DECODED_BYTES
 from zlocus.matching.level_records import READ_POINTS_PER_SIDE, level_window
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.tile import candidates_of_tile, windows_of
+from zlocus.matching.tile_candidates import candidates_of_tile, windows_of
 from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMIDS, window_showing
 
 # Time to match a cell of a core, and in addition for each view that may show it
@@ -24,7 +24,7 @@ from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMID
 CELL_S, VIEW_CELL_S = 2e-6, 3e-6
 # Peak memory of a tile: for each cell; for each cell and height step; for each cell and view that is compared; for each
 # pixel that those views show of the cells.
-CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 170, 3, 42, 10
+CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 150, 3, 38, 9
 STEPS_PER_CELL = 48
 # Memory of the reduced parts of an image for each of its pixels: five bytes for each pixel of a level.
 REDUCED_BYTES = 5 / 4**FIRST_KEPT_LEVEL * 4 / 3
@@ -141,8 +141,8 @@ def _shown_pixels(
     """Pixels of the finest level that the views of a tile show of it."""
     ground, z_range = match_scene.points_of(fine_window, 0, READ_POINTS_PER_SIDE), match_scene.expected_range
     pixels, cells = [], []
-    around, windows = windows_of(match_scene, core_window, config)
-    for number in candidates_of_tile(match_scene, core_window, around, list(windows), config):
+    numbers = list(windows_of(match_scene, core_window, config))
+    for number in candidates_of_tile(match_scene, core_window, numbers, config):
         view = match_scene.views[number]
         part = window_showing(view, ground, z_range or match_scene.z_range)
         if part is not None:
