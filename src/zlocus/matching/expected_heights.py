@@ -30,16 +30,20 @@ BELOW_M, ABOVE_M = 2.0, 25.0
 MAX_SLOPE = 0.5
 
 
-def expected_heights(match_scene: MatchScene, level: PyramidLevel) -> tuple[FloatGrid, FloatGrid] | None:
+def expected_heights(
+    match_scene: MatchScene, level: PyramidLevel, has_margins: bool = True
+) -> tuple[FloatGrid, FloatGrid] | None:
     """Lowest and highest expected height of each cell, (r, c) float32 level indices; None where no ties tell.
 
-    Around each place they are those of the nearest tie points, within the range of all of them.
+    Around each place they are those of the nearest tie points, within the range of all of them. has_margins : whether
+    objects without tie points are expected too, below and above them.
     """
     ties, in_scene = match_scene.trusted_ties, match_scene.expected_range
     if in_scene is None or not len(ties):
         return None
     places = _middles_of_squares(match_scene, level)
-    low, high = _of_nearest(places.reshape(-1, 2), ties, in_scene, _above_m(match_scene, in_scene))
+    margins = (BELOW_M, _above_m(match_scene, in_scene)) if has_margins else (0.0, 0.0)
+    low, high = _of_nearest(places.reshape(-1, 2), ties, in_scene, margins)
     rows, cols = level.shape
     bounds = []
     for z in (low, high):
@@ -79,9 +83,12 @@ def _above_m(match_scene: MatchScene, in_scene: tuple[float, float]) -> float:
 
 
 def _of_nearest(
-    places: NDArray[np.float64], ties: NDArray[np.float64], in_scene: tuple[float, float], above_m: float
+    places: NDArray[np.float64], ties: NDArray[np.float64], in_scene: tuple[float, float], margins: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lowest and highest height (m) that the ties (n, 3) around each of some places (m, 2) suggest."""
+    """Lowest and highest height (m) that the ties (n, 3) around each of some places (m, 2) suggest.
+
+    margins : below the lowest and above the highest of them, m.
+    """
     far = (in_scene[1] - in_scene[0]) / MAX_SLOPE
     low, high = np.full(len(places), in_scene[0]), np.full(len(places), in_scene[1])
     lowest, highest = places.min(axis=0) - far, places.max(axis=0) + far
@@ -95,6 +102,6 @@ def _of_nearest(
     z_low = np.sort(np.where(is_near, z, np.inf), axis=1)[:, LEFT_OUT]
     z_high = -np.sort(np.where(is_near, -z, np.inf), axis=1)[:, LEFT_OUT]
     rise = MAX_SLOPE * distance[:, 0]
-    low[enough] = np.maximum(low, z_low - BELOW_M - rise)[enough]
-    high[enough] = np.minimum(high, z_high + above_m + rise)[enough]
+    low[enough] = np.maximum(low, z_low - margins[0] - rise)[enough]
+    high[enough] = np.minimum(high, z_high + margins[1] + rise)[enough]
     return low, high

@@ -41,6 +41,9 @@ CANDIDATE_REACH = 2
 COST_OF_CANDIDATES = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
 # The cost of heights far from what the tie points suggest, at the coarsest level.
 COST_BEYOND_EXPECTED = DistanceCost(np.float32(0.0), np.float32(5.0), np.float32(20.0))
+# And of all heights below or above the tie points, objects or not: where no two images see a cell all heights cost the
+# same, so that a surface at its rim would lie anywhere.
+COST_BEYOND_TIES = DistanceCost(np.float32(0.0), np.float32(0.25), np.float32(8.0))
 # Where jumps become cheaper, heights far from the surface of the first aggregation become more expensive: so many steps
 # of the finest level are free, below and above the heights of NEARBY_CELLS. A tree is as high for images with a narrow
 # base, whose steps are large: no more than so many sides of a finest cell are free, and the cost of a step grows as the
@@ -82,9 +85,10 @@ def add_costs_beyond_expected(
     level: PyramidLevel,
 ) -> None:
     """Add the costs of heights below or above those that tie points suggest; changes `cost`, (v,) uint8."""
-    expected = expected_heights(match_scene, level)
-    if expected is not None:
-        add_costs_beyond(cost, lattice.layout, slope_surface.cells, *expected, COST_BEYOND_EXPECTED)
+    for has_margins, cost_of_distance in ((True, COST_BEYOND_EXPECTED), (False, COST_BEYOND_TIES)):
+        expected = expected_heights(match_scene, level, has_margins)
+        if expected is not None:
+            add_costs_beyond(cost, lattice.layout, slope_surface.cells, *expected, cost_of_distance)
 
 
 def misfit(cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalHeights) -> NDArray[np.float32]:
