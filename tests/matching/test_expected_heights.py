@@ -13,7 +13,7 @@ from zlocus.matching.expected_heights import ABOVE_M, BELOW_M, MAX_SLOPE, SQUARE
 from zlocus.matching.match_scene import MatchScene
 
 ORIGIN_M, STEP_M, CELL_M = 50.0, 2.0, 2.0
-ROUNDING_STEPS = 1e-3
+ROUNDING_STEPS, ROUNDING_M = 1e-3, 0.01
 
 
 def plateau(n=4000, side_m=800.0, seed=1):
@@ -22,7 +22,7 @@ def plateau(n=4000, side_m=800.0, seed=1):
     return np.column_stack([xy, np.where(xy[:, 0] < side_m / 2, 100.0, 180.0)])
 
 
-def bounds(ties, window=None, expected_range=(90.0, 200.0)):
+def bounds(ties, window=None, expected_range=(90.0, 200.0), has_margins=True):
     """Lowest and highest expected height (r, c), m, of coarsest cells whose north-west corner is at (0, 800) m."""
     window = CellWindow(0, 0, 400, 400) if window is None else window
     match_scene = MatchScene(
@@ -32,7 +32,7 @@ def bounds(ties, window=None, expected_range=(90.0, 200.0)):
     level = SimpleNamespace(
         window=window, shape=(window.rows, window.cols), number=0, height_origin=ORIGIN_M, height_step=STEP_M
     )
-    found = expected_heights(match_scene, level)
+    found = expected_heights(match_scene, level, has_margins)
     return None if found is None else tuple(ORIGIN_M + STEP_M * index for index in found)
 
 
@@ -47,6 +47,18 @@ def test_the_nearest_ties_tell_what_is_expected():
     at_edge = np.s_[:, 199:201]
     both = (low[at_edge] < 100.0) & (high[at_edge] > 180.0)
     assert both.mean() > 0.9
+
+
+def test_without_margins_only_the_heights_of_ties_are_expected():
+    """As far from the nearest tie as the ground may rise or fall."""
+    with_margins, without = bounds(plateau()), bounds(plateau(), has_margins=False)
+    low, high = without[0][:, :160], without[1][:, :160]
+    is_inside = with_margins[0][:, :160] > 90.0  # not at the end of the expected range
+    assert is_inside.mean() > 0.9
+    rise_m = 100.0 - low[is_inside]
+    assert (rise_m >= 0.0).all()
+    np.testing.assert_allclose(with_margins[0][:, :160][is_inside], low[is_inside] - BELOW_M, atol=ROUNDING_M)
+    np.testing.assert_allclose(high[is_inside], 100.0 + rise_m, atol=ROUNDING_M)
 
 
 def test_one_false_tie_suggests_nothing():

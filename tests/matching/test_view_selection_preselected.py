@@ -109,3 +109,20 @@ def test_a_tile_may_be_shown_by_more_images_than_a_block_compares():
     ground = np.column_stack([CENTRE[0] + east, CENTRE[1] + north])
     found = preselected(views, ground, Z, SelectionOptions(), np.ones(len(ground), bool))
     assert 6 < len(found) < 200
+
+
+def test_images_of_close_cameras_are_chosen_at_all_heights_of_the_ground():
+    """On a hill of 12 m an image shows less than at its foot: points there get others."""
+    turn = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    easts = np.arange(-40, 40, 2.0)
+    sensors = [FrameModel((CENTRE[0] + e, CENTRE[1], Z + 30.0), turn, 90.0, (60.0, 50.0)) for e in easts]
+    views = [View(f"v{e:g}", Path("x"), Blank(), one) for e, one in zip(easts, sensors, strict=True)]
+    east, north = (a.ravel() for a in np.meshgrid(np.linspace(-20, 20, 33), np.linspace(-4, 4, 5)))
+    ground = np.column_stack([CENTRE[0] + east, CENTRE[1] + north])
+    options, is_core, top_m = SelectionOptions(), np.ones(len(ground), bool), 12.0
+    least = {}
+    for heights in ((), (Z + top_m,)):
+        chosen_views = [easts[i] for i in preselected(views, ground, Z, options, is_core, heights)]
+        half_width = 60.0 / 90.0 * (30.0 - top_m)
+        least[heights] = min(sum(abs(at - e) < half_width for at in chosen_views) for e in east)
+    assert least[()] < options.max_images_of_point <= least[(Z + top_m,)]

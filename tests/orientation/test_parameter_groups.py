@@ -157,7 +157,7 @@ def test_pairs_are_those_that_see_a_point_together(n_views, n_points, seed):
     shuffled = rng.permutation(len(view))
     seen = Observations(view[shuffled], point[shuffled], np.zeros((len(view), 2)))
     expected = [[a, b] for a, b in combinations(range(n_views), 2) if (sees[a] & sees[b]).any()]
-    assert linked_pairs(seen, n_views, n_points).tolist() == expected
+    assert linked_pairs(seen, n_views).tolist() == expected
 
 
 class WatchedProgress(SilentProgress):

@@ -113,7 +113,7 @@ def pair_orientations(
     """
     observations, found = adjustment.observations, []
     of_view = rows_of_views(observations, len(scene.views))
-    pairs = linked_pairs(observations, len(scene.views), len(adjustment.ground_points.xyz))
+    pairs = linked_pairs(observations, len(scene.views))
     for a in np.unique(pairs[:, 0]):
         xy = observations.xy[of_view[a]]
         lines_before = Sightlines.of(scene.views[a].sensor, xy, z_range)
@@ -133,15 +133,19 @@ def pair_orientations(
     return tuple(found)
 
 
-def linked_pairs(observations: Observations, n_views: int, n_points: int) -> NDArray[np.int64]:
+def linked_pairs(observations: Observations, n_views: int) -> NDArray[np.int64]:
     """Numbers (k, 2) of the views, the smaller first, that see some point together."""
-    from scipy import sparse  # a tenth of a second
-
-    ones = np.ones(len(observations), np.float32)
-    sees = sparse.csr_array((ones, (observations.view, observations.point)), shape=(n_views, n_points))
-    together = sparse.triu(sees @ sees.T, 1).tocoo()
-    pairs = np.column_stack([together.row, together.col]).astype(np.int64)
-    return np.asarray(pairs[np.lexsort(pairs.T[::-1])])
+    by_point = np.lexsort((observations.view, observations.point))
+    view, point = observations.view[by_point].astype(np.int64), observations.point[by_point]
+    found = [np.zeros(0, np.int64)]
+    # Observations of one point follow each other, by views.
+    for distance in range(1, len(point)):
+        is_same = point[distance:] == point[:-distance]
+        if not is_same.any():
+            break
+        found.append(np.unique(view[:-distance][is_same] * n_views + view[distance:][is_same]))
+    pairs = np.column_stack(np.divmod(np.unique(np.concatenate(found)), n_views))
+    return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]])
 
 
 def median_distance(distance_px: FloatArray) -> float:

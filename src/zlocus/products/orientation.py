@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zlocus.core.scene import Scene
 from zlocus.core.sensor_model import FloatArray
-from zlocus.orientation.bundle_adjustment import BundleAdjustment
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.parameter_groups import ParameterGroup
 from zlocus.orientation.tie_residuals import Residuals
+
+if TYPE_CHECKING:
+    from zlocus.orientation.bundle_adjustment import BundleAdjustment
 
 DIGITS, DIGITS_OF_COEFFICIENTS = 6, 9
 
