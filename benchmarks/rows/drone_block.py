@@ -30,6 +30,8 @@ CELL_PX, LIMIT_PX = 2.0, 2.0
 LEAST_WITHIN = {"ground": 0.97, "building": 0.90, "tree": 0.60}
 LEAST_FILLED, MOST_CPU_S = 0.97, 25.0
 LARGER_LIMITS_M = (0.3, 1.0, 3.0)
+# Side of the square in the middle of the block that is judged for itself, m: four frames or more see nearly all of it.
+MIDDLE_M = 96.0
 # Cells of the truth along a side of the square in which a cell of the surface has its true heights.
 TRUTH_CELLS = 3
 # A cell in which true heights differ by more holds an edge, either side of which is right.
@@ -43,6 +45,7 @@ ROWS_AT_ONCE = 256
 def drone_block(workplace: Workplace, spec: DroneBlockSpec | None = None) -> list[Figure]:
     """Accuracy and cost of the surface of a whole block of 20 frames of 12 megapixels, at twice the ground pixel.
 
+    The whole block has a rim that only two or three frames see, half of its area; its middle is judged for itself too.
     spec : None for that block. The block is rendered into the folder of the row. A block of the same specification that
     lies there is used again.
     """
@@ -55,8 +58,12 @@ def drone_block(workplace: Workplace, spec: DroneBlockSpec | None = None) -> lis
     cells = true_cells(read_heights(out / "dsm.tif"), scene)
     million_cells = len(cells.xy) / 1e6
     cpu, memory = of_all_processes(json.loads((out / "run.json").read_text()))
+    limit_m, is_middle = LIMIT_PX * spec.ground_pixel_m, in_middle(cells, spec)
+    errors = errors_of_cells(read_heights(out / "dsm.tif").nearest(cells.xy), cells.heights)
+    of_middle = _figures(errors[is_middle], cells.classes[is_middle], limit_m)
     return [
-        *accuracy(out / "dsm.tif", scene, cells, LIMIT_PX * spec.ground_pixel_m),
+        *accuracy(out / "dsm.tif", scene, cells, limit_m),
+        *(replace(figure, what=f"middle, {figure.what}") for figure in of_middle),
         Figure("million cells seen by two frames", million_cells),
         Figure(
             "CPU per million cells", cpu.value / million_cells, "s", at_most=MOST_CPU_S,
@@ -75,6 +82,11 @@ def _provide_block(spec: DroneBlockSpec, scene: Path) -> None:
     described = scene / "scene.json"
     if not described.exists() or json.loads(described.read_text()).get("spec") != json.loads(json.dumps(asdict(spec))):
         raise CannotRun(f"{scene} holds another scene; remove it")
+
+
+def in_middle(cells: TrueCells, spec: DroneBlockSpec) -> np.ndarray:
+    """Which cells lie in the square in the middle of a block, (n,) bool."""
+    return (np.abs(cells.xy - (spec.east_m, spec.north_m)) <= MIDDLE_M / 2).all(axis=1)
 
 
 def accuracy(dsm: Path, scene: Path, cells: TrueCells, limit_m: float) -> list[Figure]:

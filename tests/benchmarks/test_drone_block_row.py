@@ -90,6 +90,9 @@ def test_the_row_renders_matches_and_judges(
     assert values["within two ground pixels: ground"] == pytest.approx(is_right.mean(), abs=SHARE)
     assert values["within 1 m: all"] == pytest.approx((has_height & ~is_wrong).mean(), abs=SHARE)
     assert values["CPU per million cells"] == pytest.approx(4.0 / (len(x) / 1e6))
+    # The small block lies in the square that is the middle of a large one.
+    of_whole = "within two ground pixels: ground"
+    assert values[f"middle, {of_whole}"] == values[of_whole]
     assert values["peak memory of a process"] == 0.9
     assert all(figure.fails_when for figure in figures.values() if figure.bar)
 
