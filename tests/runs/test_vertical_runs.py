@@ -297,7 +297,7 @@ def open_scene_of(views):
 
 def test_nothing_is_above_a_geoid_in_a_local_frame(geoid, tmp_path, monkeypatch):
     scene = open_scene_of(views_of([None, None], (100, 80)))
-    monkeypatch.setattr("zlocus.pipeline.setup.open_scene", lambda *_: scene)
+    monkeypatch.setattr("zlocus.pipeline.setup.open_scene", lambda inputs, crs, chosen: chosen(scene))
     inputs, above = (tmp_path / "scene.yaml",), str(geoid)
     says = r"frame is local, where no place is above the geoid of slope\.tif\. Leave --vertical out"
     with pytest.raises(GeometryError, match=says):

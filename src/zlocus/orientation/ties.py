@@ -184,8 +184,8 @@ def neighbours(views: Sequence[View], z_range: tuple[float, float], margin_px: f
     found = [np.arange(len(views)) if is_infinite else unlimited for is_infinite in ~is_finite]
     outlines = box(*boxes[numbers].reshape(-1, 4).T)
     first, second = STRtree(outlines).query(outlines)
-    ends = np.searchsorted(first, np.arange(len(numbers) + 1)) if (np.diff(first) >= 0).all() else None
-    assert ends is not None, "the index answers in the order of the questions"
+    assert (np.diff(first) >= 0).all(), "the index answers in the order of the questions"
+    ends = np.searchsorted(first, np.arange(len(numbers) + 1))
     for k, number in enumerate(numbers.tolist()):
         found[number] = np.union1d(found[number], numbers[second[ends[k] : ends[k + 1]]])
     return tuple(each[each != number] for number, each in enumerate(found))

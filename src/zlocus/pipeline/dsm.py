@@ -149,9 +149,8 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
     if request.report:
         write_report_inputs(out, setup, opened_inputs.vertical_datum, config, watch, progress)
         remove_outdated_curves(out, inputs, progress)
-    record = run_record(request, config, setup, opened_inputs.vertical_datum, checksums, tally)
-    record |= {"setup_sha256": digest, "plan": plan.as_dict(), "stages": watch.stages}
-    write_maps(request, config, watch, record, progress)
+    record = run_record(request, config, setup, opened_inputs.vertical_datum, checksums, tally, plan)
+    write_maps(request, config, watch, record | {"setup_sha256": digest, "stages": watch.stages}, progress)
     tile_run.end(failed, tally)
     shortcoming = shortcoming_of(tally, setup.doubts, out, progress)
     write_finished(out, checkpoint.key, shortcoming)

@@ -21,6 +21,7 @@ from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.messages import grave_doubt
+from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
 from zlocus.products.derived import link_all, write_derived
@@ -119,6 +120,7 @@ def run_record(
     vertical_datum: VerticalDatum,
     inputs: Sequence[Mapping[str, Any]],
     tally: Tally,
+    plan: Plan,
 ) -> dict[str, Any]:
     """The content of run.json, except the stages. inputs : path and checksum of each file."""
     return {
@@ -128,6 +130,7 @@ def run_record(
         "vertical": vertical_datum.as_dict(),
         "heights": _heights_record(setup),
         **tally.as_dict(),
+        "plan": plan.as_dict(),
     }
 
 
