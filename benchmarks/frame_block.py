@@ -28,6 +28,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
+from workplace import table_line
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import DsmRequest, SetupRequest
@@ -183,7 +184,7 @@ class PlannedBlock:
             self.n_frames, self.n_tiles, f"{self.open_s:.1f}", f"{self.orient_s:.1f}", f"{self.setup_s:.1f}",
             f"{self.wall_s:.0f}", f"{self.peak_mb:.0f}",
         )  # fmt: skip
-        return "| " + " | ".join(map(str, cells)) + " |"
+        return table_line(cells)
 
 
 PLAN_HEAD = (
@@ -270,7 +271,7 @@ class MatchedPart:
             f"{self.cpu_s / self.million:.1f}", f"{self.match_cpu_s / self.million:.1f}", f"{self.peak_mb:.0f}",
             f"{self.nmad_m:.2f}", f"{100 * self.within_1m:.1f}", f"{100 * self.filled:.1f}",
         )  # fmt: skip
-        return "| " + " | ".join(map(str, cells)) + " |"
+        return table_line(cells)
 
 
 PART_HEAD = (

@@ -41,7 +41,7 @@ from rasterio.rpc import RPC
 from rasterio.windows import Window
 
 from frame_block import Survey, measure_frames
-from workplace import CannotRun, ended
+from workplace import CannotRun, ended, table_line
 from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.sensors.rpc_fit import fit_rpc
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -198,7 +198,7 @@ class Growth:
             f"{self.match_cpu_s / self.million:.2f}", f"{self.cpu_s_per_million:.2f}", f"{self.worker_mb:.0f}",
             f"{self.command_mb:.0f}", f"{100 * self.filled:.1f}",
         )  # fmt: skip
-        return "| " + " | ".join(map(str, cells)) + " |"
+        return table_line(cells)
 
 
 HEAD = (

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,11 @@ sys.exit(status)
 
 class CannotRun(Exception):
     """Reason why a row or a benchmark has no figures."""
+
+
+def table_line(cells: Iterable[object]) -> str:
+    """A line of a table in Markdown."""
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 def ended(main: Callable[[], object]) -> None:
