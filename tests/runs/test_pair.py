@@ -35,7 +35,9 @@ def test_a_pair_is_matched_with_the_penalty_of_pairs_and_all_grey_differences(im
 
 def test_the_penalty_of_one_step_follows_the_images_that_see_the_ground(images, tmp_path, monkeypatch):
     found, of_images = set(), semiglobal.penalty_of_one_step
-    monkeypatch.setattr(semiglobal, "penalty_of_one_step", lambda p1, n: found.add((p1, n)) or of_images(p1, n))
+    monkeypatch.setattr(
+        semiglobal, "penalty_of_one_step", lambda p1, n, step: found.add((p1, n)) or of_images(p1, n, step)
+    )
     heights(images, 2, tmp_path / "two")
     assert found == {(100, 2.0)}
     heights(images, 3, tmp_path / "three")

@@ -22,7 +22,7 @@ from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.match_scene import height_step, reference_first
 from zlocus.matching.occlusion import PAIR, covered_heights
 from zlocus.matching.radiometry import GreyScale
-from zlocus.matching.semiglobal import SemiGlobalHeights, aggregate, jump_penalties
+from zlocus.matching.semiglobal import USUAL_STEP_CELLS, SemiGlobalHeights, aggregate, jump_penalties
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileGrid, tile_views
 from zlocus.matching.view_pixels import read_pixels, window_showing
@@ -215,7 +215,7 @@ def semiglobal(
     *,
     ortho: NDArray[np.float32] | None = None,
     options: SemiGlobalOptions | None = None,
-    step_cells: float = 1.0,
+    step_cells: float = USUAL_STEP_CELLS,
     n_images: int = PAIR,
 ) -> SemiGlobalHeights:
     """Heights by the semi-global constraint on a matching cost of one's own.

@@ -20,6 +20,8 @@ from zlocus.matching.occlusion import PAIR
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
 # P1 is divided by the number of images less one, but is not below this: many images err together.
 LEAST_P1 = 45
+# The defaults of P1 are those of height steps of so many cells, or more: those of satellite images.
+USUAL_STEP_CELLS = 1.5
 # Cells that only two images cover ask for so many times the contrast of an edge that opens a jump.
 PAIR_CONTRAST = np.float32(4.0)
 
@@ -98,10 +100,11 @@ def aggregate(
     """Heights with the least sum of the path costs over 8 paths.
 
     cost : (v,) uint8, see `HeightLattice.layout`; p2 : see `jump_penalties`; step_cells : height step divided by the
-    side of a cell; n_images : that see a cell, see `penalty_of_one_step`. Two predecessors find more roofs and take up
-    to twice the time; with a narrow base, where a step is as high as a storey, they find few more.
+    side of a cell, from which P1 follows if it is not set; n_images : that see a cell; see `penalty_of_one_step` for
+    both. Two predecessors find more roofs and take up to twice the time; with a narrow base, where a step is as high as
+    a storey, they find few more.
     """
-    p1 = penalty_of_one_step(value_of(options, "p1"), n_images)
+    p1 = penalty_of_one_step(value_of(options, "p1"), n_images, step_cells if options.p1 is None else USUAL_STEP_CELLS)
     if (options.predecessors or (1 if step_cells > NARROW_BASE_STEP_CELLS else 2)) == 2:
         return heights_of_sums(more_global_path_sums(cost, lattice, p2, p1), lattice)
     total = np.empty(lattice.size, np.uint16)
@@ -110,14 +113,20 @@ def aggregate(
     return heights_of_sums(total, lattice)
 
 
-def penalty_of_one_step(p1: int, n_images: float) -> int:
-    """P1 where so many images see a cell.
+def penalty_of_one_step(p1: int, n_images: float, step_cells: float = USUAL_STEP_CELLS) -> int:
+    """P1 where so many images see a cell, and a height step is so many cells high.
 
-    p1 : where two do. n images compare a height n - 1 times without repeating what was compared already, so that the
-    noise of their mean cost is smaller, and the constraint has to smooth less.
+    p1 : where two images see it, for height steps of USUAL_STEP_CELLS or more. n images compare a height n - 1 times
+    without repeating what was compared already, so that the noise of their mean cost is smaller, and the constraint has
+    to smooth less.
+
+    Where the base is wide, a step is lower than a cell: the same slope takes more steps, and each of them says less.
+    P1 decreases with the square of the height of a step, as the logarithm of a normal distribution of slopes does, and
+    its least value with that height.
     """
-    of_images = p1 / max(n_images - 1.0, 1.0)
-    return min(max(round(of_images), LEAST_P1), p1)
+    share = min(step_cells / USUAL_STEP_CELLS, 1.0)
+    of_two, least = round(p1 * share**2), round(LEAST_P1 * share)
+    return min(max(round(of_two / max(n_images - 1.0, 1.0)), least), of_two)
 
 
 def winner_takes_all_heights(cost: NDArray[np.uint8], lattice: HeightLattice) -> SemiGlobalHeights:
