@@ -19,6 +19,7 @@ from zlocus.io.open_raster import open_raster
 from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.sensors.distortion import BrownDistortion
+from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.drone_block import (
     DroneBlockSpec,
     RenderedDroneBlock,
@@ -29,9 +30,9 @@ from zlocus.synthetic.drone_block import (
     written_cameras,
 )
 from zlocus.synthetic.drone_ground import CAR, PAVEMENT, TARGET_BLACK_PX, TARGET_WHITE_PX, ColouredGround
-from zlocus.synthetic.drone_photo import DronePhoto
+from zlocus.synthetic.drone_photo import DronePhoto, SplinedRays, seen_colours
 from zlocus.synthetic.drone_truth import n_frames_showing
-from zlocus.synthetic.render import Sun, sunlit, visible_ground_points
+from zlocus.synthetic.render import Sun, render, sunlit, visible_ground_points
 from zlocus.synthetic.scenes import Exposure
 from zlocus.synthetic.terrain import BUILDING, ROAD, TREE, SyntheticGround
 
@@ -39,6 +40,8 @@ from zlocus.synthetic.terrain import BUILDING, ROAD, TREE, SyntheticGround
 READ_PX = 1e-6
 # Centroids of targets of 8 px in images with noise and compression; and half of the window that holds a target.
 TARGET_PX, REACH_PX = 0.1, 10
+# Of a hundred targets, whose errors have a standard deviation of 0.03 px.
+MEAN_OF_TARGETS_PX = 0.02
 # Points around a target that the frame has to show, and how far the ground there may lie above or below the middle.
 ANGLES, FLAT_M = np.arange(8) * np.pi / 4, 0.3
 # Overlaps are exact for the same principal point; that of the next strip is turned by 180 degrees.
@@ -46,6 +49,10 @@ OVERLAP = 0.012
 HEIGHT_M = 1e-4
 # Two ground pixels, and the share of the cells that have to be as near to the truth; cells with an edge are left out.
 NEAR_M, SHARE_NEAR = 0.4, 0.85
+
+
+# Radiance and factors of colours of equal rays, and the share of the pixels of a row that have to be equal.
+SAME_LIGHT, SHARE_SAME = 2e-3, 0.97
 
 
 def tiny(seed: int = 3, **changes: object) -> DroneBlockSpec:
@@ -120,6 +127,141 @@ def is_evenly_lit(ground: SyntheticGround, sun: Sun, targets: np.ndarray) -> np.
     cells = [(int((ground.y0 - y) / ground.step), int((x - ground.x0) / ground.step)) for x, y, _ in targets]
     parts = [lit[i - reach : i + reach + 1, j - reach : j + reach + 1] for i, j in cells]
     return np.array([part.all() or not part.any() for part in parts])
+
+
+@pytest.fixture(scope="module")
+def moving() -> DroneBlockSpec:
+    """Strips and crossing strips of a drone that flies 8 px in a read-out, with a camera stated wrongly."""
+    return small_drone_block_spec(
+        4, frames_per_strip=1, crossing_strips=2, crossing_tilt_deg=15.0, readout_s=0.15, speed_m_s=10.0,
+        n_targets=40, trees_per_ha=5.0, stated_distortion=BrownDistortion(k1=-0.2), stated_readout_s=0.02,
+        stated_focal_px=424.0,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def moving_block(moving: DroneBlockSpec, tmp_path_factory: pytest.TempPathFactory) -> RenderedDroneBlock:
+    return render_drone_block(moving, tmp_path_factory.mktemp("moving") / "block")
+
+
+def velocities_of(spec: DroneBlockSpec) -> dict[str, np.ndarray]:
+    """Velocities (3,) m/s by frame, written out from the headings of the strips."""
+    of_strip = {"s1": 20.0, "s2": 200.0, "c1": 110.0, "c2": 290.0}
+    return {
+        f"{strip}_{number}": spec.speed_m_s * np.array([np.sin(np.deg2rad(h)), np.cos(np.deg2rad(h)), 0.0])
+        for strip, h in of_strip.items()
+        for number in (1, 2, 3)
+    }
+
+
+def slowly_projected(exposure: Exposure, spec: DroneBlockSpec, velocity: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Column and row at which a frame shows a point (3,): of a camera at rest for the time of every row, the one that
+    sees the point in that row, between two rows in proportion. A camera that has moved sees the point as one that has
+    not would see it moved backwards."""
+    at_rest, rows = replace(exposure.sensor, rolling_shutter=None), np.arange(-50, spec.rows + 50)
+    seconds = spec.readout_s * (rows - (spec.rows - 1) / 2) / spec.rows
+    seen = at_rest.image_from_ground(point - seconds[:, None] * velocity)
+    ahead = seen[:, 1] - rows
+    (first,) = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] < 0))
+    share = ahead[first] / (ahead[first] - ahead[first + 1])
+    return seen[first] + share * (seen[first + 1] - seen[first])
+
+
+def test_targets_are_where_a_rolling_shutter_sees_them(
+    moving_block: RenderedDroneBlock, moving: DroneBlockSpec
+) -> None:
+    """In the JPEGs, against a camera at rest for the time of every row."""
+    exposures = drone_exposures(moving)
+    ground = build_drone_ground(moving, exposures).ground
+    targets = np.array(json.loads((moving_block.folder / "scene.json").read_text())["targets"])
+    velocities, last = velocities_of(moving), np.array([559, 419])
+    reach_m = (TARGET_WHITE_PX + TARGET_BLACK_PX) / 2 * moving.ground_pixel_m
+    evenly_lit = is_evenly_lit(ground, moving.sun, targets)
+    around = np.array([(0, 0), *(6.0 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)]))])
+    errors, moved = [], []
+    for exposure in exposures:
+        image, still = grey(moving_block.images[exposure.view.name]), replace(exposure.sensor, rolling_shutter=None)
+        for number, target in enumerate(targets):
+            ((column, row),) = still.image_from_ground(target[None])
+            if not (evenly_lit[number] and 20 < column < last[0] - 20 and 20 < row < last[1] - 20):
+                continue
+            at = slowly_projected(exposure, moving, velocities[exposure.view.name], target)
+            seen = visible_ground_points(ground, exposure.sensor, at + around)
+            if np.abs(seen[:, 2] - target[2]).max() < FLAT_M:
+                errors.append(centroid(image, exposure, target, reach_m) - at)
+                moved.append(np.hypot(*(at - (column, row))))
+    assert len(errors) >= 40
+    # Some targets of many lie beside something that is as bright.
+    assert (np.abs(errors).max(axis=1) < TARGET_PX).mean() > 0.95
+    assert np.abs(np.mean(errors, axis=0)).max() < MEAN_OF_TARGETS_PX
+    assert max(moved) > 3.0
+
+
+def test_each_row_is_rendered_from_where_the_camera_is_then(moving: DroneBlockSpec) -> None:
+    """Light and colours of a row are those of a camera that stands still at the time of that row."""
+    exposure = drone_exposures(moving)[1]
+    velocity, shape = velocities_of(moving)["s2_1"], exposure.shape
+    coloured = build_drone_ground(moving, (exposure,))
+    lit, still = sunlit(coloured.ground, moving.sun), replace(exposure.sensor, rolling_shutter=None)
+
+    def light_of(camera: FrameModel) -> np.ndarray:
+        return render(coloured.ground, SplinedRays(camera, shape), shape, moving.sun, 1, lit)
+
+    def at_the_time_of(row: float) -> FrameModel:
+        seconds = moving.readout_s * (row - 209.5) / 420
+        return replace(still, centre=tuple(np.array(still.centre) + seconds * velocity))
+
+    light, colours = light_of(exposure.sensor), seen_colours(coloured, exposure.sensor, shape)
+    for row in (0, 105, 210, 314, 419):
+        assert share_equal(light[row], light_of(at_the_time_of(row))[row]) > SHARE_SAME
+        of_colours = row // 2
+        then = seen_colours(coloured, at_the_time_of(2 * of_colours + 0.5), shape)
+        assert share_equal(colours[:, of_colours], then[:, of_colours]) > SHARE_SAME
+    unmoved = light_of(still)
+    assert max(share_equal(light[row], unmoved[row]) for row in (0, 419)) < 0.5
+
+
+def share_equal(values: np.ndarray, others: np.ndarray) -> float:
+    """Share of the values that are equal. Rays along the border of two cells may meet either."""
+    return float(np.isclose(values, others, rtol=0, atol=SAME_LIGHT).mean())
+
+
+def test_the_scene_file_states_the_camera_that_was_asked_for(
+    moving_block: RenderedDroneBlock, moving: DroneBlockSpec
+) -> None:
+    """And `scene.json` the poses and the whole specification, the true camera included."""
+    velocities = velocities_of(moving)
+    for view, exposure in zip(open_scene([moving_block.scene]).views, drone_exposures(moving), strict=True):
+        assert (view.sensor.focal, exposure.sensor.focal) == (424.0, 420.0)
+        assert (view.sensor.distortion, exposure.sensor.distortion) == (BrownDistortion(k1=-0.2), moving.distortion)
+        stated, true = view.sensor.rolling_shutter, exposure.sensor.rolling_shutter
+        assert (stated.readout_s, true.readout_s) == (0.02, 0.15)
+        for each in (stated, true):
+            np.testing.assert_allclose(each.velocity, velocities[view.name], rtol=0, atol=1e-9)
+            assert each.rows == 420
+        assert view.sensor.centre == exposure.sensor.centre
+    assert json.loads((moving_block.folder / "scene.json").read_text())["spec"]["readout_s"] == 0.15
+
+
+def test_crossing_strips_look_forwards_at_the_same_ground() -> None:
+    steady = {"least_tilt_deg": 0.0, "largest_tilt_deg": 0.0, "heading_noise_deg": 0.0, "flight_noise_m": 0.0}
+    spec = small_drone_block_spec(crossing_strips=2, crossing_tilt_deg=15.0, frames_per_strip=3, **steady)
+    exposures = {exposure.view.name: exposure.sensor for exposure in drone_exposures(spec)}
+    assert len(exposures) == 12
+    velocities = velocities_of(replace(spec, speed_m_s=1.0))
+    middle = np.array([spec.east_m, spec.north_m])
+    for strip in ("s", "c"):
+        axes = []
+        for name in (f"{strip}{k}_{number}" for k in (1, 2) for number in (1, 2, 3)):
+            sensor = exposures[name]
+            tilt_deg = np.rad2deg(np.arccos(-sensor.rotation[2, 2]))
+            assert tilt_deg == pytest.approx(15.0 if strip == "c" else 0.0, abs=1e-4)
+            forward = velocities[name]
+            assert (sensor.rotation[2] @ forward > 0.2) == (strip == "c")
+            # The top of the image points forwards.
+            assert -sensor.rotation[1] @ forward > 0.9
+            axes.append(sensor.ground_from_image(np.array([sensor.principal_point]), np.array([spec.middle_m]))[0, :2])
+        np.testing.assert_allclose(np.mean(axes, axis=0), middle, rtol=0, atol=1e-3)
 
 
 def centroid(image: np.ndarray, exposure: Exposure, target: np.ndarray, reach_m: float) -> np.ndarray:
@@ -271,6 +413,8 @@ def test_written_cameras_have_the_errors_that_were_asked_for(tmp_path: Path) -> 
         ({"least_tilt_deg": 4.0}, "largest_tilt_deg = 3.0 is less than least_tilt_deg = 4.0"),
         ({"flying_height_m": 40.0, "relief_m": 60.0}, "flying_height_m = 40.0 m is not above trees"),
         ({"distortion": BrownDistortion(k1=-1.0)}, "does not map all of the frame"),
+        ({"stated_distortion": BrownDistortion(k1=-1.0)}, r"stated_distortion does not map all of the frame"),
+        ({"crossing_tilt_deg": 60.0}, r"crossing_tilt_deg = 60\.0 is outside its range 0\.0 to 30\.0"),
         ({"photo": DronePhoto(quality=0)}, "photo.quality = 0 is outside its range 1 to 100"),
         ({"seed": -1}, "seed = -1 is outside its range"),
     ],

@@ -1,7 +1,8 @@
 """A block of images of a drone over a rendered settlement, with its exact truth.
 
-A consumer drone flies parallel strips at a constant height. Its frames are colour JPEGs of a lens with distortion. They
-are rendered through the sensor model that is written to `scene.yaml`, so the truth is exact.
+A consumer drone flies parallel strips at a constant height, and strips across them where that is asked for. Its frames
+are colour JPEGs of a lens with distortion, and of a rolling shutter where a read-out time is given. They are rendered
+through exact sensor models, which are written to `scene.yaml` unless errors are asked for, so the truth is exact.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pyproj import CRS
@@ -20,7 +22,8 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rolling_shutter_entry
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 from zlocus.sensors.distortion import BrownDistortion, Distortion
-from zlocus.sensors.frame import FrameModel, rotation_from_angles
+from zlocus.sensors.frame import FrameModel, as_row, rotation_from_angles
+from zlocus.sensors.rolling_shutter import RollingShutter
 from zlocus.synthetic.drone_ground import ColouredGround, Settlement, build_settlement
 from zlocus.synthetic.drone_photo import DronePhoto, photographed, write_photo
 from zlocus.synthetic.drone_trees import TALLEST_TREE_M
@@ -72,6 +75,21 @@ class DroneBlockSpec(Checked):
     angle_error_deg: float = option(
         0.0, "Standard deviation, about each axis, of the errors of written attitudes.", low=0.0, high=10.0, unit="deg"
     )
+    crossing_strips: int = option(
+        0, "Number of strips across the others, over the middle of the block.", low=0, high=50
+    )
+    crossing_tilt_deg: float = option(
+        0.0, "Tilt of the frames of crossing strips from the nadir, forwards.", low=0.0, high=30.0, unit="deg"
+    )
+    readout_s: float = option(
+        0.0, "Time in which the rows of a frame are read, from the first to the last. 0: all at once.", low=0.0,
+        high=1.0, unit="s",
+    )  # fmt: skip
+    speed_m_s: float = option(8.0, "Speed along the strip during the read-out.", low=0.0, high=50.0, unit="m/s")
+    # What `scene.yaml` states of the camera instead of the truth; None is the truth.
+    stated_distortion: Distortion | None = field(default=None)
+    stated_focal_px: float | None = option(None, "Focal length that is stated.", low=50.0, high=50000.0, unit="px")
+    stated_readout_s: float | None = option(None, "Read-out time that is stated.", low=0.0, high=1.0, unit="s")
     step_m: float = option(0.04, "Cell of the height field and of the truth.", low=0.01, high=5.0, unit="m")
     samples: int = option(2, "Rays per pixel and axis.", low=1, high=8)
     base_m: float = option(480.0, "Lowest ellipsoidal height of the terrain.", low=-400.0, high=8000.0, unit="m")
@@ -100,11 +118,13 @@ class DroneBlockSpec(Checked):
                 f"DroneBlockSpec.flying_height_m = {self.flying_height_m} m is not above trees of {TALLEST_TREE_M:g} m "
                 f"on terrain with relief_m = {self.relief_m}. Fly higher, or choose less relief_m."
             )
-        if not np.isfinite(_level_camera(self).ray_from_image(_outline(self))).all():
-            raise ConfigError(
-                "DroneBlockSpec.distortion does not map all of the frame: choose a longer focal_px or smaller "
-                "coefficients."
-            )
+        camera = _level_camera(self)
+        for name, each in (("distortion", camera), ("stated_distortion", _with_stated_interior(self, camera))):
+            if not np.isfinite(each.ray_from_image(_outline(self))).all():
+                raise ConfigError(
+                    f"DroneBlockSpec.{name} does not map all of the frame: choose a longer focal_px or smaller "
+                    "coefficients."
+                )
 
     @property
     def ground_pixel_m(self) -> float:
@@ -159,29 +179,68 @@ def frame_spacing(spec: DroneBlockSpec) -> tuple[float, float]:
     return (1.0 - spec.forward_overlap) * along, (1.0 - spec.side_overlap) * across
 
 
-def drone_exposures(spec: DroneBlockSpec) -> tuple[Exposure, ...]:
-    """The exposures of all frames with exact cameras, strip by strip. Every second strip is flown backwards."""
-    rng = np.random.default_rng([spec.seed, FLIGHT_STREAM])
+class Strip(NamedTuple):
+    """A strip of a block. name : prefix of the names of its frames; heading_deg : of the flight, clockwise from north;
+    stations : (n, 3) m, planned positions of its frames; tilt_deg : of the frames from the nadir, forwards."""
+
+    name: str
+    heading_deg: float
+    stations: FloatArray
+    tilt_deg: float
+
+
+def flown_strips(spec: DroneBlockSpec) -> list[Strip]:
+    """The strips of a block: parallel ones, then those across. Of both, every second one is flown backwards.
+
+    The frames of crossing strips are taken so far before the others that their optical axes meet the same ground.
+    """
     along_m, across_m = frame_spacing(spec)
-    heading = np.deg2rad(spec.heading_deg)
-    forward = np.array([np.sin(heading), np.cos(heading), 0.0])
-    right = np.array([np.cos(heading), -np.sin(heading), 0.0])
     middle = np.array([spec.east_m, spec.north_m, spec.middle_m + spec.flying_height_m])
+    before_m = spec.flying_height_m * np.tan(np.deg2rad(spec.crossing_tilt_deg))
+    kinds = (("s", spec.strips, 0.0, 0.0, 0.0), ("c", spec.crossing_strips, 90.0, before_m, spec.crossing_tilt_deg))
+    strips, number = [], np.arange(spec.frames_per_strip)
+    for prefix, n_strips, turn_deg, before, tilt_deg in kinds:
+        heading = np.deg2rad(spec.heading_deg + turn_deg)
+        forward = np.array([np.sin(heading), np.cos(heading), 0.0])
+        right = np.array([np.cos(heading), -np.sin(heading), 0.0])
+        for strip in range(n_strips):
+            backwards_deg, sense = (180.0, -1.0) if strip % 2 == 1 else (0.0, 1.0)
+            ahead = (number - (spec.frames_per_strip - 1) / 2) * along_m * sense - sense * before
+            aside = (strip - (n_strips - 1) / 2) * across_m
+            stations = middle + ahead[:, None] * forward + aside * right
+            heading_deg = spec.heading_deg + turn_deg + backwards_deg
+            strips.append(Strip(f"{prefix}{strip + 1}", heading_deg, stations, tilt_deg))
+    return strips
+
+
+def drone_exposures(spec: DroneBlockSpec) -> tuple[Exposure, ...]:
+    """The exposures of all frames with exact cameras, strip by strip (see `flown_strips`)."""
+    rng = np.random.default_rng([spec.seed, FLIGHT_STREAM])
     result = []
-    for strip in range(spec.strips):
-        is_back = strip % 2 == 1
-        for number in range(spec.frames_per_strip):
-            ahead = (number - (spec.frames_per_strip - 1) / 2) * along_m * (-1.0 if is_back else 1.0)
-            aside = (strip - (spec.strips - 1) / 2) * across_m
-            centre = middle + ahead * forward + aside * right + spec.flight_noise_m * rng.standard_normal(3)
+    for strip in flown_strips(spec):
+        for number, station in enumerate(strip.stations):
+            centre = station + spec.flight_noise_m * rng.standard_normal(3)
             tilt, towards = rng.uniform(spec.least_tilt_deg, spec.largest_tilt_deg), rng.uniform(0.0, 2.0 * np.pi)
-            turned = spec.heading_deg + (180.0 if is_back else 0.0) + spec.heading_noise_deg * rng.standard_normal()
+            turned = strip.heading_deg + spec.heading_noise_deg * rng.standard_normal()
             angles = (float(tilt * np.cos(towards)), float(tilt * np.sin(towards)), float(-turned))
-            x, y, z = map(float, centre)
-            camera = replace(_level_camera(spec), centre=(x, y, z), camera_from_ground=rotation_from_angles(*angles))
-            view = ViewSpec(f"s{strip + 1}_{number + 1}", 0.0, 0.0, float(turned), spec.sun)
+            camera = replace(
+                _level_camera(spec), centre=as_row(centre), camera_from_ground=rotation_from_angles(*angles),
+                rolling_shutter=_rolling_shutter(spec, strip.heading_deg),
+            )  # fmt: skip
+            if strip.tilt_deg:
+                camera = camera.corrected(np.zeros(3), np.deg2rad([strip.tilt_deg, 0.0, 0.0]))
+            view = ViewSpec(f"{strip.name}_{number + 1}", 0.0, 0.0, float(turned), spec.sun)
             result.append(Exposure(view, camera, (spec.rows, spec.columns)))
     return tuple(result)
+
+
+def _rolling_shutter(spec: DroneBlockSpec, heading_deg: float) -> RollingShutter | None:
+    """The motion of a drone that flies level in a direction; None where all rows are read at once."""
+    if not (spec.readout_s or spec.stated_readout_s):
+        return None
+    heading = np.deg2rad(heading_deg)
+    velocity = (float(spec.speed_m_s * np.sin(heading)), float(spec.speed_m_s * np.cos(heading)), 0.0)
+    return RollingShutter(spec.readout_s, velocity, spec.rows)
 
 
 def _level_camera(spec: DroneBlockSpec) -> FrameModel:
@@ -280,15 +339,29 @@ def frame_model(exposure: Exposure) -> FrameModel:
 
 
 def written_cameras(spec: DroneBlockSpec, exposures: tuple[Exposure, ...]) -> tuple[FrameModel, ...]:
-    """The cameras with the errors of position and attitude with which `scene.yaml` has them; none by default."""
+    """The cameras with the errors of position and attitude, and the lens and read-out time, that `scene.yaml` states.
+
+    By default they are exact.
+    """
     rng = np.random.default_rng([spec.seed, ERROR_STREAM])
     cameras = []
     for exposure in exposures:
         offset = spec.position_error_m * rng.standard_normal(3)
         turn = np.deg2rad(spec.angle_error_deg) * rng.standard_normal(3)
-        camera = frame_model(exposure)
+        camera = _with_stated_interior(spec, frame_model(exposure))
         cameras.append(camera.corrected(offset, turn) if offset.any() or turn.any() else camera)
     return tuple(cameras)
+
+
+def _with_stated_interior(spec: DroneBlockSpec, camera: FrameModel) -> FrameModel:
+    """A camera with the interior orientation and the read-out time that `scene.yaml` states."""
+    if spec.stated_focal_px is not None:
+        camera = replace(camera, focal=spec.stated_focal_px)
+    if spec.stated_distortion is not None:
+        camera = replace(camera, distortion=spec.stated_distortion)
+    if spec.stated_readout_s is not None and camera.rolling_shutter is not None:
+        camera = replace(camera, rolling_shutter=replace(camera.rolling_shutter, readout_s=spec.stated_readout_s))
+    return camera
 
 
 def _write_scene_file(
