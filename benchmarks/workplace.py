@@ -89,13 +89,14 @@ class Figure:
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU of a command with its children, memory of its largest process (GB of 1024^3 bytes), its exit status, and the
-    time from its start to its end."""
+    """CPU of a command with its children, memory of its largest process (GB of 1024^3 bytes), its exit status, the time
+    from its start to its end, and all that it said."""
 
     cpu_s: float
     peak_gb: float
     status: int = 0
     wall_s: float = 0.0
+    said: str = ""
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def run(command: list[Any], accept: tuple[int, ...] = (0,), cwd: Path | None = N
             said = (done.stderr.strip() or done.stdout.strip() or "nothing said").splitlines()
             raise CannotRun(f"`{' '.join(map(str, command[:3]))} ...` exits {done.returncode}: {said[-1]}")
         cpu_s, peak_kb, wall_s = map(float, usage.read_text().split())
-    return Usage(cpu_s, peak_kb / 1024**2, done.returncode, wall_s)
+    return Usage(cpu_s, peak_kb / 1024**2, done.returncode, wall_s, done.stdout + done.stderr)
 
 
 def rendered_images(scene: Path, views: tuple[str, ...] = RENDERED_VIEWS) -> list[Path]:

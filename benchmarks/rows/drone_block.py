@@ -52,7 +52,7 @@ def drone_block(workplace: Workplace, spec: DroneBlockSpec | None = None) -> lis
     spec = DroneBlockSpec() if spec is None else spec
     scene, out = workplace.out / "block", workplace.out / "dsm"
     workplace.inputs["seeds"] = [spec.seed]
-    _provide_block(spec, scene)
+    provide_block(spec, scene)
     command = [ZLOCUS, "dsm", scene / "scene.yaml", "-o", out, "--resolution", CELL_PX * spec.ground_pixel_m]
     run([*command, "--workers", 1, "--no-report", "--overwrite"], accept=(0, COVERAGE_SHORT))
     cells = true_cells(read_heights(out / "dsm.tif"), scene)
@@ -74,7 +74,7 @@ def drone_block(workplace: Workplace, spec: DroneBlockSpec | None = None) -> lis
     ]  # fmt: skip
 
 
-def _provide_block(spec: DroneBlockSpec, scene: Path) -> None:
+def provide_block(spec: DroneBlockSpec, scene: Path) -> None:
     """Render the block, unless the folder holds one of the same specification."""
     if not scene.exists():
         render_drone_block(spec, scene)

@@ -55,6 +55,7 @@ ROWS: dict[str, Row] = {
     "dmc": Row("rows.photographs:dmc"),
     "tuniu": Row("rows.photographs:tuniu"),
     "drone-block": Row("rows.drone_block:drone_block", WITH_RENDERER, is_slow=True),
+    "self-calibration": Row("rows.self_calibration:self_calibration", WITH_RENDERER, is_slow=True),
     "herzjesu": Row("rows.photographs:herzjesu"),
     "pairs-of-triplet": Row("rows.real_images:pairs_of_triplet", WITHOUT_TRUTH),
     "independent-surfaces": Row("rows.real_images:independent_surfaces", WITHOUT_TRUTH),

@@ -81,6 +81,7 @@ RUN_BY = {
     "rows/real_images.py": "test_real_images.py::test_a_row_judges_a_surface_by_the_image_that_was_left_out",
     "rows/rendered.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/resources.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "rows/self_calibration.py": "test_self_calibration_row.py::test_errors_are_given_by_their_stated_sigmas",
     "rows/satellite.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "same_pixels.py": "test_same_pixels.py::test_each_planted_difference_is_one_sentence",
     "seeds.py": "test_seeds.py::test_mean_spread_and_worst_of_several_seeds",
