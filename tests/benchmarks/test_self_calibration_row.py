@@ -66,7 +66,7 @@ class Program:
             held = {"held_because": {name: self.reason}} if self.reason else {}
             return {"added": {name: 0.0}, "sigma_after": {name: None}} | held
         seed = json.loads((scene / "scene.json").read_text())["seed"]
-        planted = {"k1": -0.10, "k2": 0.03, "readout_ms": 30.0}[name]
+        planted = {"k1": -0.26, "k2": 0.10, "readout_ms": 30.0}[name]
         return {"added": {name: planted + ERRORS[seed][name] * SIGMAS[name]}, "sigma_after": {name: self.sigmas[name]}}
 
 
@@ -86,7 +86,7 @@ def test_errors_are_given_by_their_stated_sigmas(program: Program, tmp_path: Pat
         "k1": pytest.approx(2.5), "k2": pytest.approx(1.0), "readout_ms": pytest.approx(3.5),
     }  # fmt: skip
     assert [scaled[name].passes for name in ("k1", "k2", "readout_ms")] == [True, True, False]
-    assert figures["k1: stated sigma by planted value, largest"].value == pytest.approx(0.04)
+    assert figures["k1: stated sigma by planted value, largest"].value == pytest.approx(0.004 / 0.26)
     assert figures["read-out time: stated sigma by planted value, largest"].value == pytest.approx(2.0 / 30.0)
     assert figures["flat block, focal length held and said so"].passes
     # Without and with self-calibration for each seed, then the flat block.
@@ -116,7 +116,7 @@ def test_a_focal_length_that_is_changed_or_held_in_silence_misses_its_bar(
 
 
 def test_the_blocks_state_another_camera_than_the_one_that_renders_them() -> None:
-    assert row.planted_values(row.BLOCK) == {"k1": -0.10, "k2": 0.03, "readout_ms": pytest.approx(30.0)}
+    assert row.planted_values(row.BLOCK) == {"k1": -0.26, "k2": 0.10, "readout_ms": pytest.approx(30.0)}
     assert row.BLOCK.stated_distortion == BrownDistortion()
     assert row.FLAT_BLOCK.stated_focal_px != row.FLAT_BLOCK.focal_px
     tilts = row.FLAT_BLOCK.least_tilt_deg, row.FLAT_BLOCK.largest_tilt_deg, row.FLAT_BLOCK.crossing_strips

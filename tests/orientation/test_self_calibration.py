@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pyproj import CRS
 
 from bundle_scenes import first_points, flight_of_frames, seen_by, views_of
 from calibration_scenes import (
@@ -19,9 +20,13 @@ from calibration_scenes import (
 )
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
-from zlocus.orientation import bundle_adjustment, normal_equations
+from zlocus.core.scene import Scene
+from zlocus.orientation import bundle_adjustment, normal_equations, orientation
 from zlocus.orientation.bundle_adjustment import adjust_bundle
-from zlocus.orientation.self_calibration import calibration_groups, check_self_calibration
+from zlocus.orientation.self_calibration import calibration_groups, check_self_calibration, interior_change_px
+from zlocus.orientation.tie_refinement import RefinedTies
+from zlocus.orientation.ties import Ties
+from zlocus.orientation.triangulate import Observations
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 
 SIGMAS = 3.0
@@ -201,3 +206,93 @@ def test_a_standard_deviation_of_what_is_not_calibrated_is_refused():
         BundleAdjustmentOptions(sigma_focal_px=10.0)
     with pytest.raises(ConfigError, match="self_calibration = 'focus' is not one of all, focal"):
         BundleAdjustmentOptions(self_calibration=("focus",))
+
+
+# Distance by which a wrongly stated lens may move features so that they still lie near enough to their epipolar curves.
+NEAR_ENOUGH_PX = 12.0
+
+
+class Searches:
+    """Stands for the search for ties: those are found whose image points the lens of the search moves by little."""
+
+    def __init__(self, exact, delivered):
+        self.exact, self.delivered, self.scenes = exact, delivered, []
+        self.seen, xyz = seen_by(exact, block_ground(600, 8.0), DRONE_SIZE, 0.1)
+        self.z = xyz[:, 2]
+
+    def __call__(self, scene, options, z_range_hint, progress, threads):
+        self.scenes.append(scene)
+        off = np.empty(len(self.seen))
+        for number, (view, exact) in enumerate(zip(scene.views, self.exact, strict=True)):
+            mine = self.seen.view == number
+            at = exact.ray_from_image(self.seen.xy[mine])
+            lens = replace(exact, distortion=view.sensor.distortion, rolling_shutter=None)
+            off[mine] = np.hypot(*(lens.image_from_ray(at) - self.seen.xy[mine]).T)
+        found = self.seen.kept(off < NEAR_ENOUGH_PX)
+        found = found.kept(np.bincount(found.point, minlength=len(self.z))[found.point] >= 2)
+        points, number = np.unique(found.point, return_inverse=True)
+        found = Observations(found.view, number, found.xy)
+        return RefinedTies(Ties(found, self.z[points], (), (-1.0, 9.0)), found)
+
+
+def orientation_after(searches, monkeypatch, options, **request):
+    """The orientation of the delivered cameras by the ties that `searches` finds."""
+    monkeypatch.setattr(orientation, "_measure_ties", searches)
+    scene = Scene(tuple(views_of(searches.delivered, DRONE_SIZE)), CRS.from_epsg(32632), heights=(-1.0, 9.0))
+    return orientation.orient(scene, replace(options, model="joint"), orientation.OrientationRequest(**request))
+
+
+@pytest.fixture
+def wrongly_stated():
+    """Cameras with a lens that moves the corners by 140 px, and the same without it and with errors of their poses."""
+    exact = [replace(camera, distortion=BrownDistortion(-0.10, 0.03)) for camera in crossing_block()]
+    return Searches(exact, flawed_poses([replace(camera, distortion=None) for camera in exact], 2))
+
+
+LENS_OPTIONS = options_with("k1", "k2", sigma_distortion_px=150.0)
+
+
+def test_ties_are_searched_again_with_the_lens_that_was_found(wrongly_stated, monkeypatch):
+    """From their delivered poses, until the lens stays as it is; then ties are found in whole images."""
+    found = orientation_after(wrongly_stated, monkeypatch, LENS_OPTIONS)
+    first, *again = wrongly_stated.scenes
+    assert [view.sensor for view in first.views] == wrongly_stated.delivered
+    assert 1 <= len(again) < orientation.MAX_SEARCHES
+    last = [view.sensor for view in again[-1].views]
+    assert len({sensor.distortion for sensor in last}) == 1
+    assert last[0].distortion.k1 == pytest.approx(-0.10, abs=0.01)
+    for sensor, delivered in zip(last, wrongly_stated.delivered, strict=True):
+        assert replace(sensor, distortion=None) == delivered
+    farthest = [np.hypot(*(ties.xy - 2000.0).T).max() for ties in (
+        wrongly_stated(first, None, None, None, 1).observations, found.refined_ties.observations,
+    )]  # fmt: skip
+    assert farthest[0] < 0.8 * farthest[1]
+    (k1, k2) = found.bundle_adjustment.calibration
+    assert abs(k1.value + 0.10) < SIGMAS * k1.sigma
+    assert abs(k2.value - 0.03) < SIGMAS * k2.sigma
+
+
+def test_known_ties_of_a_search_with_the_lens_make_the_same_orientation(wrongly_stated, monkeypatch):
+    found = orientation_after(wrongly_stated, monkeypatch, LENS_OPTIONS)
+    n_searches = len(wrongly_stated.scenes)
+    again = orientation_after(wrongly_stated, monkeypatch, LENS_OPTIONS, refined_ties=found.refined_ties)
+    assert len(wrongly_stated.scenes) == n_searches
+    assert again.bundle_adjustment.sensors == found.bundle_adjustment.sensors
+
+
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_ties_are_searched_once_where_no_lens_was_found_to_be_wrong(wrongly_stated, monkeypatch, is_calibrated):
+    """With the right lens, and with a wrong one that is not to be corrected."""
+    if is_calibrated:
+        wrongly_stated.delivered = flawed_poses(wrongly_stated.exact, 2)
+    orientation_after(wrongly_stated, monkeypatch, LENS_OPTIONS if is_calibrated else options_with())
+    assert len(wrongly_stated.scenes) == 1
+
+
+def test_the_change_of_a_camera_is_that_beyond_the_motion_of_its_image():
+    camera = replace(flat_block(0.0)[0], distortion=None, rolling_shutter=None)
+    moved, longer = camera.moved(40.0, -30.0), replace(camera, focal=camera.focal * 1.01)
+    one, *others = (views_of([each], DRONE_SIZE) for each in (camera, moved, longer))
+    # A longer focal length moves points away from the middle of the image, those in the corners farthest.
+    for other, expected in zip(others, (0.0, 0.01 * np.hypot(1999.5, 1499.5)), strict=True):
+        assert interior_change_px(one, other, 0.0) == pytest.approx(expected, abs=1e-6)

@@ -81,6 +81,11 @@ class BundleAdjustment:
                     found.append(CalibratedParameter(group.views, name, words, values[name], sigma, bool(is_held)))
         return tuple(found)
 
+    def with_calibration_alone(self, sensors: Sequence[SensorModel]) -> tuple[SensorModel, ...]:
+        """The sensors as delivered, with the parameters that the self-calibration found, but with their own poses."""
+        is_calibration = np.repeat([group.is_calibration for group in self.groups], [len(each) for each in self.groups])
+        return corrected_sensors(self.groups, sensors, np.where(is_calibration, self.solution.parameters, 0.0))
+
 
 def adjust_bundle(
     views: Sequence[View],

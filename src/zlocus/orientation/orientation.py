@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 INLIER_SHARE_OF_REFINED_TIES = 0.5
 # Where poses are corrected, ties may lie this many times farther from one common shift of their pair.
 POSE_TOLERANCE_FACTOR = 3.0
+# Largest number of searches for ties where a self-calibration changes the cameras that they are searched with.
+MAX_SEARCHES = 3
 
 
 @dataclass(frozen=True)
@@ -185,12 +187,14 @@ def orient(
         from zlocus.orientation.self_calibration import check_self_calibration
 
         check_self_calibration(scene.views, options)
+    strict = replace(options, inlier_px=options.inlier_px * INLIER_SHARE_OF_REFINED_TIES)
+    solver = CameraSolver(scene, strict, options.model == "joint", request.control, request.terrain)
     refined = request.refined_ties
     if refined is None:
         refined = _measure_ties(scene, options, request.z_range_hint, progress, threads)
+        if solver.uses_bundle_adjustment and options.bundle_adjustment.self_calibration:
+            refined = _measured_by_calibrated_cameras(solver, refined, options, request.z_range_hint, threads)
     ties, xyz = refined.ties, first_ground_points(scene, refined.ties)
-    strict = replace(options, inlier_px=options.inlier_px * INLIER_SHARE_OF_REFINED_TIES)
-    solver = CameraSolver(scene, strict, options.model == "joint", request.control, request.terrain)
     cameras, wrong, contradictions = without_contradicting_images(solver, refined.observations, xyz)
     line_shifts = no_line_shifts(scene.views)
     if options.line_shifts and options.model != "none":
@@ -251,3 +255,33 @@ def _measure_ties(
     )
     observations = refine_ties(scene.views, ties.observations, jacobian, options, threads)
     return RefinedTies(replace(ties, pairs=()), observations)
+
+
+def _measured_by_calibrated_cameras(
+    solver: CameraSolver,
+    refined_ties: RefinedTies,
+    options: OrientationOptions,
+    z_range_hint: tuple[float, float] | None,
+    threads: int,
+) -> RefinedTies:
+    """Ties that are searched again where a self-calibration shows that the cameras of the search were wrong.
+
+    Features far from the epipolar curves of the stated lens are no ties. Those near the borders, which tell most about
+    a lens, are then missing, and a few that agree by chance take their place. The poses of all searches are those that
+    were delivered.
+    """
+    from zlocus.orientation.self_calibration import interior_change_px
+
+    scene, searched = solver.scene, solver.scene
+    for _ in range(MAX_SEARCHES - 1):
+        xyz = first_ground_points(scene, refined_ties.ties)
+        cameras, _, _ = without_contradicting_images(solver, refined_ties.observations, xyz)
+        assert cameras.bundle_adjustment is not None, "callers make sure"
+        sensors = cameras.bundle_adjustment.with_calibration_alone([view.sensor for view in scene.views])
+        views = tuple(replace(view, sensor=sensor) for view, sensor in zip(scene.views, sensors, strict=True))
+        middle_m = sum(refined_ties.ties.z_range) / 2
+        if interior_change_px(searched.views, views, middle_m) <= POSE_TOLERANCE_FACTOR * options.inlier_px:
+            break
+        searched = replace(scene, views=views)
+        refined_ties = _measure_ties(searched, options, z_range_hint, None, threads)
+    return refined_ties

@@ -31,6 +31,9 @@ DISTORTION = {
 # Power of the distance from the principal point with which each coefficient moves image points, and largest factor.
 POWER = {"k1": (3, 1.0), "k2": (5, 1.0), "k3": (7, 1.0), "p1": (2, 3.0), "p2": (2, 3.0)}
 
+# Points along each side of an image at which cameras are compared.
+CHANGE_POINTS = 9
+
 
 def check_self_calibration(views: Sequence[View], options: OrientationOptions) -> None:
     """Refuse parameters that are requested by name and that a camera of the scene does not have.
@@ -136,6 +139,24 @@ def _with_readout(sensor: FrameModel, values: FloatArray) -> FrameModel:
     assert rolling_shutter is not None, "groups fit their sensors"
     readout_s = rolling_shutter.readout_s + float(values[0])
     return replace(sensor, rolling_shutter=replace(rolling_shutter, readout_s=readout_s))
+
+
+def interior_change_px(views: Sequence[View], others: Sequence[View], z: float) -> float:
+    """Largest distance (px) by which image points move from some cameras to others of equal poses, beyond the mean
+    motion of their image, which errors of poses explain too.
+
+    views, others : the same images; z : height of the ground, m. Points that only one of the cameras sees are left out.
+    """
+    largest = 0.0
+    for view, other in zip(views, others, strict=True):
+        rows, columns = (np.linspace(0.0, n - 1.0, CHANGE_POINTS) for n in view.image.shape)
+        column, row = np.meshgrid(columns, rows)
+        xy = np.column_stack([column.ravel(), row.ravel()])
+        moved = other.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z))) - xy
+        moved = moved[np.isfinite(moved).all(axis=1)]
+        if len(moved):
+            largest = max(largest, float(np.hypot(*(moved - moved.mean(axis=0)).T).max()))
+    return largest
 
 
 def has_coefficient(sensor: SensorModel, name: str) -> bool:
