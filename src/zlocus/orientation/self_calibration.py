@@ -141,18 +141,19 @@ def _with_readout(sensor: FrameModel, values: FloatArray) -> FrameModel:
     return replace(sensor, rolling_shutter=replace(rolling_shutter, readout_s=readout_s))
 
 
-def interior_change_px(views: Sequence[View], others: Sequence[View], z: float) -> float:
+def interior_change_px(views: Sequence[View], other_views: Sequence[View], z: float) -> float:
     """Largest distance (px) by which image points move from some cameras to others of equal poses, beyond the mean
     motion of their image, which errors of poses explain too.
 
-    views, others : the same images; z : height of the ground, m. Points that only one of the cameras sees are left out.
+    views, other_views : the same images; z : height of the ground, m. Points that only one of the cameras sees are left
+    out.
     """
     largest = 0.0
-    for view, other in zip(views, others, strict=True):
+    for view, other_view in zip(views, other_views, strict=True):
         rows, columns = (np.linspace(0.0, n - 1.0, CHANGE_POINTS) for n in view.image.shape)
         column, row = np.meshgrid(columns, rows)
         xy = np.column_stack([column.ravel(), row.ravel()])
-        moved = other.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z))) - xy
+        moved = other_view.sensor.image_from_ground(view.sensor.ground_from_image(xy, np.full(len(xy), z))) - xy
         moved = moved[np.isfinite(moved).all(axis=1)]
         if len(moved):
             largest = max(largest, float(np.hypot(*(moved - moved.mean(axis=0)).T).max()))

@@ -179,7 +179,7 @@ def frame_spacing(spec: DroneBlockSpec) -> tuple[float, float]:
     return (1.0 - spec.forward_overlap) * along, (1.0 - spec.side_overlap) * across
 
 
-class Strip(NamedTuple):
+class FlownStrip(NamedTuple):
     """A strip of a block. name : prefix of the names of its frames; heading_deg : of the flight, clockwise from north;
     stations : (n, 3) m, planned positions of its frames; tilt_deg : of the frames from the nadir, forwards."""
 
@@ -189,7 +189,7 @@ class Strip(NamedTuple):
     tilt_deg: float
 
 
-def flown_strips(spec: DroneBlockSpec) -> list[Strip]:
+def flown_strips(spec: DroneBlockSpec) -> list[FlownStrip]:
     """The strips of a block: parallel ones, then those across. Of both, every second one is flown backwards.
 
     The frames of crossing strips are taken so far before the others that their optical axes meet the same ground.
@@ -209,7 +209,7 @@ def flown_strips(spec: DroneBlockSpec) -> list[Strip]:
             aside = (strip - (n_strips - 1) / 2) * across_m
             stations = middle + ahead[:, None] * forward + aside * right
             heading_deg = spec.heading_deg + turn_deg + backwards_deg
-            strips.append(Strip(f"{prefix}{strip + 1}", heading_deg, stations, tilt_deg))
+            strips.append(FlownStrip(f"{prefix}{strip + 1}", heading_deg, stations, tilt_deg))
     return strips
 
 
@@ -353,15 +353,15 @@ def written_cameras(spec: DroneBlockSpec, exposures: tuple[Exposure, ...]) -> tu
     return tuple(cameras)
 
 
-def _with_stated_interior(spec: DroneBlockSpec, camera: FrameModel) -> FrameModel:
+def _with_stated_interior(spec: DroneBlockSpec, sensor: FrameModel) -> FrameModel:
     """A camera with the interior orientation and the read-out time that `scene.yaml` states."""
     if spec.stated_focal_px is not None:
-        camera = replace(camera, focal=spec.stated_focal_px)
+        sensor = replace(sensor, focal=spec.stated_focal_px)
     if spec.stated_distortion is not None:
-        camera = replace(camera, distortion=spec.stated_distortion)
-    if spec.stated_readout_s is not None and camera.rolling_shutter is not None:
-        camera = replace(camera, rolling_shutter=replace(camera.rolling_shutter, readout_s=spec.stated_readout_s))
-    return camera
+        sensor = replace(sensor, distortion=spec.stated_distortion)
+    if spec.stated_readout_s is not None and sensor.rolling_shutter is not None:
+        sensor = replace(sensor, rolling_shutter=replace(sensor.rolling_shutter, readout_s=spec.stated_readout_s))
+    return sensor
 
 
 def _write_scene_file(
