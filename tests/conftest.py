@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -47,6 +48,13 @@ def pytest_sessionstart(session):
 
         with kernels_compiling(), TemporaryDirectory() as folder:
             render_scene(replace(city_spec(16), size=32), Path(folder) / "scene")
+
+
+def pytest_collection_finish():
+    """Let Python's collector of unused objects leave out the thousands of tests, and look at the others as rarely as
+    `precompile` does: kernels that are compiled in tests make millions of objects."""
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
 
 
 def pytest_collection_modifyitems(items):
