@@ -57,9 +57,10 @@ CLUSTER = """
 from zlocus.core import startup
 startup.prepare()
 from zlocus.core.errors import ConfigError
-from zlocus.pipeline.execution.cluster import Cluster
+from zlocus.pipeline.execution import cluster
+cluster.CONNECT_S = 1.0
 try:
-    Cluster(print, "tcp://127.0.0.1:9")
+    cluster.Cluster(print, "tcp://127.0.0.1:9")
 except ConfigError as error:
     print(error)
 """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
+import shutil
 import signal
-import subprocess
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import laspy
 import numpy as np
 import pytest
 
-from interrupted_runs import cloud_command, n_finished, started, wait_for_tiles
+from interrupted_runs import cloud_command, given_again, n_finished, started, wait_for_tiles
 from rendered_scenes import HEIGHTS, LOOKS, PART, SIZE_PX
 from zlocus.core.errors import OutputError, StoppedError
 from zlocus.core.options import PyramidOptions, RunConfig
@@ -64,9 +65,9 @@ def test_a_killed_run_is_resumed_with_the_same_points(images, straight, tmp_path
     assert not (out / "cloud.laz").exists()
     # Where the run had begun to write points, an incomplete file is left.
     (out / ".cloud.laz.123456.part").touch()
-    again = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert f"{n} of {N_TILES} tiles of images are there already." in again.stderr
-    assert "The tie points of the interrupted run are used again." in again.stderr
+    said = given_again(words)
+    assert f"{n} of {N_TILES} tiles of images are there already." in said
+    assert "The tie points of the interrupted run are used again." in said
     assert_same(out, straight)
 
 
@@ -138,13 +139,13 @@ def test_points_that_cannot_be_written_leave_the_tiles(images, straight, tmp_pat
     assert_same(out, straight)
 
 
-def test_the_same_command_after_success_makes_nothing(images, straight, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    first, _ = made(images, out)
+def test_the_same_command_after_success_makes_nothing(images, straight, tmp_path):
+    out = Path(shutil.copytree(straight, tmp_path / "out"))
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     again, _ = made(images, out)
-    assert (again.was_finished, again.n_points) == (True, first.n_points)
-    assert again.coverage == pytest.approx(first.coverage, abs=1e-6)
+    record = json.loads((straight / "run.json").read_text())
+    assert (again.was_finished, again.n_points) == (True, record["points"])
+    assert again.coverage == pytest.approx(record["coverage"], abs=1e-6)
     assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
     with pytest.raises(OutputError, match="--no-resume asks not to take"):
         made(images, out, resume=False)
@@ -161,8 +162,7 @@ def test_the_same_command_after_success_makes_nothing(images, straight, tmp_path
 
 
 def test_another_cloud_replaces_all_maps(images, straight, tmp_path):
-    out = tmp_path / "out"
-    made(images, out)
+    out = Path(shutil.copytree(straight, tmp_path / "out"))
     made(images, out, references=("fore",), overwrite=True)
     assert sorted(path.name for path in out.glob("*.tif")) == ["fore_height.tif", "fore_quality.tif"]
 
@@ -192,11 +192,12 @@ def test_points_are_written_while_others_are_matched(images, tmp_path, monkeypat
 
 def test_memory_does_not_grow_with_the_number_of_tiles(images, tmp_path):
     """By Python's own count of memory, to which mapped files do not belong: the tiles of one image, and of three."""
+    made(images, tmp_path / "first", references=("nadir",), partial=True)
     peaks = []
-    for name, references in (("first", ("nadir",)), ("one", ("nadir",)), ("three", ())):
+    for name, references in (("one", ("nadir",)), ("three", ())):
         tracemalloc.start()
         made(images, tmp_path / name, references=references, partial=True)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     arrays_bytes = 2 * SIZE_PX**2 * CLOUD_PIXEL_BYTES
-    assert peaks[2] - peaks[1] < 0.3 * arrays_bytes
+    assert peaks[1] - peaks[0] < 0.3 * arrays_bytes

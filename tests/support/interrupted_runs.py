@@ -8,8 +8,10 @@ import sys
 import time
 
 import psutil
+from typer.testing import CliRunner
 
 from rendered_scenes import HEIGHTS, SMALL_TILES
+from zlocus.cli.app import app
 from zlocus.pipeline.execution.checkpoint import DONE, FOLDER
 
 
@@ -20,6 +22,13 @@ def command(images, out, folder, *more, tile=SMALL_TILES.pyramid.tile):
     asked = ["--crs", "EPSG:32632", "--resolution", "0.5", "--heights", *map(str, HEIGHTS), "--no-report"]
     words = ["dsm", *map(str, images.inputs), "-o", str(out), *asked, "--config", str(options), *more]
     return [sys.executable, "-m", "zlocus", *words]
+
+
+def given_again(words):
+    """What a command of `command` or `cloud_command` says that is given again and succeeds, in this process."""
+    done = CliRunner().invoke(app, words[words.index("zlocus") + 1 :])
+    assert done.exit_code == 0, done.output
+    return done.stderr
 
 
 def started(words):

@@ -16,7 +16,7 @@ from pathlib import Path
 import distributed
 import pytest
 
-from interrupted_runs import check_end, command, n_finished, started, wait_for_tiles
+from interrupted_runs import check_end, command, given_again, n_finished, started, wait_for_tiles
 from places import SUPPORT
 from rendered_scenes import N_SMALL_TILES, SMALL_TILES, run
 from worker_tasks import Planted
@@ -154,6 +154,13 @@ def test_failures_on_a_cluster(tmp_path):
     assert [ends[n].result[0] for n in (0, 8)] == [0, 64]
 
 
+@pytest.fixture
+def short_wait(monkeypatch):
+    """An address at which nothing answers is given up soon."""
+    monkeypatch.setattr("zlocus.pipeline.execution.cluster.CONNECT_S", 1.0)
+
+
+@pytest.mark.usefixtures("short_wait")
 def test_where_nothing_answers(images, tmp_path):
     for address in ("tcp://127.0.0.1:9", "nonsense"):
         with pytest.raises(ConfigError, match=rf"--scheduler {address} does not answer"):
@@ -163,6 +170,7 @@ def test_where_nothing_answers(images, tmp_path):
         run(images("sine"), tmp_path / "out", SMALL_TILES, scheduler="tcp://127.0.0.1:9", method="gc3-sgm")
 
 
+@pytest.mark.usefixtures("short_wait")
 def test_a_client_that_found_nobody_is_collected_at_once(tmp_path):
     """It closes itself then. While another client starts, both would wait for one lock of `distributed` without end."""
 
@@ -204,8 +212,6 @@ def test_a_signal_ends_the_command_and_not_the_cluster(images, straight, tmp_pat
         check_end(process.returncode, signal.SIGTERM, stderr)
         assert "tiles are finished and kept: the same command resumes from there" in stderr
         assert n_finished(out)
-        again = subprocess.run(words, capture_output=True, text=True)
-        assert again.returncode == 0, again.stderr
-        assert "tiles are there already" in again.stderr
+        assert "tiles are there already" in given_again(words)
         assert same(out, straight)
         assert found.workers[0].poll() is None
