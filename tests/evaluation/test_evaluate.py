@@ -6,15 +6,16 @@ import json
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 from rasterio.warp import Resampling, reproject
+from typer.testing import CliRunner
 
 from evaluation_rasters import CRS, NORTH, WEST, grid, write
+from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
@@ -26,7 +27,6 @@ from zlocus.evaluation.truth import truth_blocks
 SHIFT_TOLERANCE_M = 0.03
 # Half of it is the judge's rounding of errors to three digits.
 JUDGES_DIFFER = 1e-3
-ZLOCUS = Path(sys.executable).with_name("zlocus")
 FIGURES = ("complete", "within", "median", "nmad", "rmse", "le90")
 
 
@@ -428,8 +428,8 @@ def test_three_cases_agree_with_the_independent_judge_to_a_thousandth(tmp_path, 
     path = write(tmp_path / "d.tif", dsm.astype(np.float32), at, crs)
     command = [sys.executable, judge, path, reference, "--class", classes, "--margin", "10", "--json"]
     theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    mine = [ZLOCUS, "evaluate", path, reference, "--classes", classes, "--margin", "10", "--json"]
-    ours = json.loads(subprocess.run(mine, capture_output=True, check=True).stdout)
+    mine = ["evaluate", path, reference, "--classes", classes, "--margin", "10", "--json"]
+    ours = json.loads(CliRunner().invoke(app, list(map(str, mine)), catch_exceptions=False).stdout)
     names = ("completeness", "within", "median", "nmad", "rmse", "le90")
     for kind in ("all", "ground", "building", "tree"):
         if theirs[kind]["within"] == 0 == theirs[kind]["complete"]:

@@ -47,12 +47,13 @@ def test_a_case_computed_by_hand(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cell_m", "places_per_block"), [(0.7, None), (0.98, None), (1.0, (2, 2)), (1.3, (3, 3)), (90, (32, 32))]
+    ("cell_m", "side_m", "places_per_block"),
+    [(0.7, 60, None), (0.98, 60, None), (1.0, 60, (2, 2)), (1.3, 60, (3, 3)), (90, 180, (32, 32))],
 )
-def test_cells_twice_as_large_are_compared_with_means(tmp_path, cell_m, places_per_block):
-    n = round(180 / cell_m)
+def test_cells_twice_as_large_are_compared_with_means(tmp_path, cell_m, side_m, places_per_block):
+    n = round(side_m / cell_m)
     dsm, reference = (
-        laid(tmp_path / "d.tif", ground(360, 0.5), 0.5),
+        laid(tmp_path / "d.tif", ground(2 * side_m, 0.5), 0.5),
         laid(tmp_path / "r.tif", ground(n, cell_m), cell_m),
     )
     result = evaluate(dsm, Comparison(reference, margin_m=0))
@@ -116,8 +117,8 @@ def test_larger_cells_in_degrees(tmp_path):
 
 
 def test_many_blocks_are_looked_at_as_few_at_a_time(tmp_path, monkeypatch):
-    dsm = laid(tmp_path / "d.tif", ground(200, 0.5), 0.5)
-    reference = laid(tmp_path / "r.tif", ground(33, 3, part=6), 3)
+    dsm = laid(tmp_path / "d.tif", ground(100, 0.5), 0.5)
+    reference = laid(tmp_path / "r.tif", ground(16, 3, part=6), 3)
     whole = evaluate(dsm, Comparison(reference))
     monkeypatch.setattr("zlocus.evaluation.frame.PLACES_AT_A_TIME", 100)
     assert evaluate(dsm, Comparison(reference)) == whole

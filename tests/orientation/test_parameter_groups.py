@@ -116,6 +116,11 @@ def ties(scene):
     return find_ties(scene, OPTIONS)
 
 
+@pytest.fixture(scope="module")
+def oriented(scene):
+    return orient(scene, OPTIONS)
+
+
 def assert_same(found, expected):
     for name in ("view", "point", "xy"):
         np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
@@ -124,7 +129,7 @@ def assert_same(found, expected):
 
 
 @pytest.mark.parametrize("threads", [2, 5])
-def test_threads_change_nothing(scene, ties, threads, monkeypatch):
+def test_threads_change_nothing(scene, ties, oriented, threads, monkeypatch):
     """However late the first pairs come."""
     plain = ties_module.match_pair
 
@@ -134,9 +139,9 @@ def test_threads_change_nothing(scene, ties, threads, monkeypatch):
 
     monkeypatch.setattr(ties_module, "match_pair", late)
     assert_same(find_ties(scene, OPTIONS, threads=threads), ties)
-    one, several = (orient(scene, OPTIONS, threads=n) for n in (1, threads))
-    np.testing.assert_array_equal(one.xyz, several.xyz)
-    assert one.as_dict() == several.as_dict()
+    several = orient(scene, OPTIONS, threads=threads)
+    np.testing.assert_array_equal(oriented.xyz, several.xyz)
+    assert oriented.as_dict() == several.as_dict()
 
 
 def test_descriptors_on_disk_are_the_same(scene, ties, monkeypatch):
@@ -186,11 +191,10 @@ def test_progress_only_grows(scene):
     assert 0.5 < sum(watched.shares) <= 1.0 + 1e-9
 
 
-def test_corrections_of_many_images_are_told_in_short(scene):
-    found = orient(scene, OPTIONS)
-    few = what_was_applied(found)
+def test_corrections_of_many_images_are_told_in_short(oriented):
+    few = what_was_applied(oriented)
     assert "view1 (" in few
-    many = replace(found, views=tuple(replace(found.views[1], name=f"v{k}") for k in range(MAX_NAMED + 1)))
+    many = replace(oriented, views=tuple(replace(oriented.views[1], name=f"v{k}") for k in range(MAX_NAMED + 1)))
     assert len(what_was_applied(many)) < 120
     assert "up to " in what_was_applied(many)
 
@@ -198,6 +202,7 @@ def test_corrections_of_many_images_are_told_in_short(scene):
 SIZE_PX, STEP_PX, N_VIEWS = 120, 40, 60
 
 
+@pytest.fixture(scope="module")
 def strip():
     """A strip of views, each a third of an image further than the one before, and darker or brighter, and all of their
     ground, (n, 3) m."""
@@ -216,16 +221,16 @@ def strip():
     return tuple(views), exposures, at
 
 
-def test_every_image_of_a_long_strip_gets_enough_points():
-    views, _, at = strip()
+def test_every_image_of_a_long_strip_gets_enough_points(strip):
+    views, _, at = strip
     n_seen = np.bincount(greys_of(views, at).view, minlength=N_VIEWS)
     assert n_seen.min() > 3 * MIN_POINTS
     assert n_seen.max() < 3 * MAX_POINTS
 
 
-def test_neighbours_of_a_long_strip_agree():
+def test_neighbours_of_a_long_strip_agree(strip):
     """Each with those that see the same ground; from end to end a little is left."""
-    views, exposures, at = strip()
+    views, exposures, at = strip
     scales = grey_scales(views, at)
     zero = (np.array([scale.mean for scale in scales]) - exposures[:, 0]) / exposures[:, 1]
     unit = np.array([scale.contrast for scale in scales]) / exposures[:, 1]
@@ -234,10 +239,10 @@ def test_neighbours_of_a_long_strip_agree():
 
 
 @pytest.mark.parametrize("n_points", [40, 60, 100])
-def test_points_that_tell_little_are_no_fault(n_points):
+def test_points_that_tell_little_are_no_fault(strip, n_points):
     """Views that agree on their few points to the bit leave no noise to weigh the prior by, and nothing but the prior
     holds one that shares none."""
-    views, _, at = strip()
+    views, _, at = strip
     ground = at[:: len(at) // n_points]
     same = tuple(replace(view, image=views[0].image, sensor=views[0].sensor) for view in views[:8])
     inside = ground * [SIZE_PX / ((N_VIEWS - 1) * STEP_PX + SIZE_PX), 0.8, 1.0]

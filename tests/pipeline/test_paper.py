@@ -61,11 +61,26 @@ def folders(tmp_path_factory):
     return {space: tmp_path_factory.mktemp("paper") / space for space in ("image", "ground")}
 
 
-def made(town, folders, space, what, *more):
-    """The folder of a space with the files of a command, and what it prints."""
-    result = zl(what, *town, "-o", folders[space], "--space", space, "--overwrite", *more)
-    assert result.exit_code == 0, result.output
-    return folders[space], result.stdout
+@pytest.fixture(scope="module")
+def printed():
+    """What the commands without further options have printed, by their folder and name."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def made(town, folders, printed):
+    """The folder of a space with the files of a command, and what it prints: `made(space, what, *more)`. A command
+    without further options is run once, one with some in a folder of its own."""
+
+    def of(space, what, *more):
+        out = folders[space].with_name("asked") if more else folders[space]
+        if more or (out, what) not in printed:
+            result = zl(what, *town, "-o", out, "--space", space, "--overwrite", *more)
+            assert result.exit_code == 0, result.output
+            printed[out, what] = result.stdout
+        return out, printed[out, what]
+
+    return of
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -81,8 +96,8 @@ def curves_of(rows, prefix):
 
 @pytest.mark.parametrize("space", ["image", "ground"])
 @pytest.mark.parametrize("what", PAPER_FILES)
-def test_every_table_and_figure_is_one_command(town, folders, space, what):
-    out, text = made(town, folders, space, what)
+def test_every_table_and_figure_is_one_command(made, space, what):
+    out, text = made(space, what)
     for name in PAPER_FILES[what]:
         assert (out / name).is_file()
     assert "Reference  img_n1" in text
@@ -94,12 +109,12 @@ def test_every_table_and_figure_is_one_command(town, folders, space, what):
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
 
 
-def test_table_3_holds_what_the_curves_of_the_feature_points_show(town, folders):
-    out, _ = made(town, folders, "image", "table3")
+def test_table_3_holds_what_the_curves_of_the_feature_points_show(made):
+    out, _ = made("image", "table3")
     table = rows_of(out / "table3.csv")
     assert [row["point"] for row in table] == [f"P{k}" for k in (1, 2, 3) for _ in range(5)]
     for number, figure in enumerate(("figure3", "figure4", "figure5"), 1):
-        made(town, folders, "image", figure)
+        made("image", figure)
         curves = curves_of(rows_of(out / f"{figure}.csv"), "ncc_")
         assert all(len(curve) == 2 * REACH + 1 for curve in curves.values())
         for row in table[5 * (number - 1) : 5 * number]:
@@ -112,9 +127,9 @@ def test_table_3_holds_what_the_curves_of_the_feature_points_show(town, folders)
                 assert ratio == pytest.approx(abs(rho1 / rho2), rel=1e-3 + IN_TABLES / abs(rho2))
 
 
-def test_table_4_sums_the_labels_of_table_3(town, folders):
-    out, text = made(town, folders, "image", "table4")
-    made(town, folders, "image", "table3")
+def test_table_4_sums_the_labels_of_table_3(made):
+    out, text = made("image", "table4")
+    made("image", "table3")
     sums: dict[str, int] = {}
     for row in rows_of(out / "table3.csv"):
         sums[row["image"]] = sums.get(row["image"], 0) + int(row["label"])
@@ -145,10 +160,10 @@ def test_the_printed_values_stand_beside_ours(town, folders):
 
 
 @pytest.mark.parametrize("space", ["image", "ground"])
-def test_figures_6_and_7_stop_and_go_on(town, folders, space):
-    out, _ = made(town, folders, space, "table4")
-    _, text = made(town, folders, space, "figure6")
-    made(town, folders, space, "figure7")
+def test_figures_6_and_7_stop_and_go_on(made, space):
+    out, _ = made(space, "table4")
+    _, text = made(space, "figure6")
+    made(space, "figure7")
     used = [row["image"] for row in rows_of(out / "table4.csv") if row["used"] == "yes"]
     order = [row["image"] for row in rows_of(out / "table4.csv")]
     chosen, every = rows_of(out / "figure6.csv"), rows_of(out / "figure7.csv")
@@ -172,8 +187,8 @@ def test_figures_6_and_7_stop_and_go_on(town, folders, space):
     assert "4.5253" in text
 
 
-def test_figure_7_compares_many_points(town, folders):
-    out, text = made(town, folders, "image", "figure7", "--points", 60)
+def test_figure_7_compares_many_points(made):
+    out, text = made("image", "figure7", "--points", 60)
     rows = rows_of(out / POINTS_FILE)
     chosen, every = (np.array([float(row[f"rho1_{name}"]) for row in rows]) for name in ("chosen", "all"))
     assert f"{len(rows)} stop before the last search image" in text
@@ -182,10 +197,10 @@ def test_figure_7_compares_many_points(town, folders):
     assert all(1 <= int(row["n_chosen"]) < 5 for row in rows)
 
 
-def test_figure_8_is_a_point_in_the_reference_image_and_lines_in_the_others(town, folders):
+def test_figure_8_is_a_point_in_the_reference_image_and_lines_in_the_others(made):
     """The ray of a pixel is that pixel; the vertical line is a line in the reference image too."""
     for space in ("image", "ground"):
-        out, _ = made(town, folders, space, "figure8")
+        out, _ = made(space, "figure8")
         rows = rows_of(out / "figure8.csv")
         for name in VIEWS:
             xy = np.array([
@@ -204,21 +219,21 @@ def test_figure_8_is_a_point_in_the_reference_image_and_lines_in_the_others(town
                 assert length > 1.0
 
 
-def test_a_point_that_is_asked_for_is_shown_in_both_spaces(town, folders):
+def test_a_point_that_is_asked_for_is_shown_in_both_spaces(made):
     row, col = 60.0, 55.0
     for space in ("image", "ground"):
-        _, text = made(town, folders, space, "table4", "--pixel", row, col)
+        _, text = made(space, "table4", "--pixel", row, col)
         found = [float(v) for v in text.split("img_n1 row ")[1].split("\n")[0].split(", column ")]
         # On the ground it is the middle of the cell.
         assert np.hypot(found[0] - row, found[1] - col) < (0.06 if space == "image" else 1.5)
         place = text.split("P0         ")[1].split(" m;")[0].replace("E ", "").replace("N ", "").split(", ")
-        _, at = made(town, folders, space, "table4", "--at", place[0], place[1])
+        _, at = made(space, "table4", "--at", place[0], place[1])
         again = [float(v) for v in at.split("img_n1 row ")[1].split("\n")[0].split(", column ")]
         assert np.hypot(again[0] - found[0], again[1] - found[1]) < 1.5
 
 
-def test_the_corners_of_a_triangle_order_the_images_too(town, folders):
-    _, text = made(town, folders, "image", "table4", "--neighbours", "tin")
+def test_the_corners_of_a_triangle_order_the_images_too(made):
+    _, text = made("image", "table4", "--neighbours", "tin")
     assert "3 feature points" in text
 
 
@@ -259,8 +274,8 @@ def test_a_point_that_cannot_be_shown_is_refused(town, tmp_path, more, says):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_table_that_is_there_is_not_replaced(town, folders):
-    out, _ = made(town, folders, "image", "table3")
+def test_a_table_that_is_there_is_not_replaced(made, town):
+    out, _ = made("image", "table3")
     before = (out / "table3.csv").read_bytes()
     result = zl("table3", *town, "-o", out)
     assert result.exit_code == 2
