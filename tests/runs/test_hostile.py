@@ -34,14 +34,12 @@ from zlocus.io.images import open_image
 from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.execution.checkpoint import DONE, FOLDER, TileCheckpoint
 
+# Of the three views of a scene. A name that is refused stands alone, for nothing is made of the others.
 NAMES = (
-    "../../escaped",
-    "/tmp/escaped",
-    "a/../../escaped",
-    "..\\escaped",
-    "con\nescaped",
-    ".escaped",
-    "escaped\x1b[2J",
+    ("../../escaped", "/tmp/escaped", "a/../../escaped"),
+    ("..\\escaped", ".escaped", "third"),
+    ("con\nescaped", "plain", "third"),
+    ("escaped\x1b[2J", "plain", "third"),
 )
 
 
@@ -72,17 +70,18 @@ def scene_of(images, folder, names):
     return path
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("names", NAMES)
 @pytest.mark.parametrize("command", ["dsm", "cloud", "orient", "ties", "rank"])
-def test_names_of_views_lead_nowhere_else(images, tmp_path, command, name):
-    scene = scene_of(images, tmp_path / "deep" / "scene", [name, "plain", "third"])
+def test_names_of_views_lead_nowhere_else(images, tmp_path, command, names):
+    scene = scene_of(images, tmp_path / "deep" / "scene", names)
     out = tmp_path / "deep" / "out"
     before = below(tmp_path)
     words = [command, str(scene), "-o", str(out), "--heights", *map(str, HEIGHTS)]
     words += ["--resolution", "4", "--no-report"] if command == "dsm" else []
     words += ["--resolution", "4"] if command == "rank" else []
     result = CliRunner().invoke(app, words)
-    assert result.exit_code in (0, 2, 3), result.output
+    is_refused = any(not name.isprintable() for name in names)
+    assert result.exit_code == (2 if is_refused else 0), result.output
     after = {
         path: content for path, content in below(tmp_path).items() if Path("deep/out") not in (path, *path.parents)
     }
