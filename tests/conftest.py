@@ -24,7 +24,8 @@ SLOW = (
     "runs", "docs", "benchmarks", "pipeline", "inspector", "products/report", "cli",
     "core/test_resources.py", "core/test_signals.py", "core/test_startup.py", "core/test_startup_imports.py",
     "evaluation/test_evaluate_coarse_references.py", "io/test_io_damaged_files.py", "io/test_open_raster_remote.py",
-    "matching/test_fusion.py", "orientation/test_parameter_groups.py", "orientation/test_self_calibration.py",
+    "matching/test_fusion.py", "matching/test_true_ortho.py", "orientation/test_parameter_groups.py",
+    "orientation/test_self_calibration.py", "synthetic/test_drone_block.py", "synthetic/test_linescan.py",
     "test_api.py",
 )  # fmt: skip
 
