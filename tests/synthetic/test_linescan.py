@@ -120,7 +120,7 @@ def test_a_level_1_image_shows_what_the_raw_one_shows(spec):
 def test_a_surface_from_line_scanners(rendered, spec, tmp_path):
     """The whole way: files, tie points, tables, matching; against the truth."""
     request = DsmRequest(inputs=rendered.inputs, out=tmp_path / "out", resolution=0.2, report=False)
-    run_dsm(request, RunConfig(pyramid=PyramidOptions(tile=64)), progress_for(io.StringIO()))
+    run_dsm(request, RunConfig(pyramid=PyramidOptions(tile=128)), progress_for(io.StringIO()))
     with rasterio.open(tmp_path / "out" / "dsm.tif") as dsm, rasterio.open(rendered.truth_dsm) as truth:
         window = rasterio.windows.from_bounds(*truth.bounds, dsm.transform)
         found = dsm.read(1, window=window.round_offsets().round_lengths())

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,6 +71,7 @@ def test_cores_are_about_as_large_as_asked(rows, cols, tile):
     assert sum(t.core_window.rows * t.core_window.cols for t in plan_tiles(seen, seen, options)) == rows * cols
 
 
+@cache
 def scene_of(n_views, size=280, cell_m=0.5, z=(90.0, 130.0)):
     """Images of the same ground, looking elsewhere, and one of ground far away."""
     looks = [(0.05 * k, 0.0) for k in range(n_views - 1)]
