@@ -119,3 +119,33 @@ def test_either_side_of_an_edge_is_right() -> None:
     flat, edge = [5.0] * 9, [5.0] * 6 + [8.0] * 3
     found = row.errors_of_cells(np.array([5.5, 8.1, 6.0, np.nan]), np.array([flat, edge, edge, flat]))
     np.testing.assert_allclose(found, [0.5, 0.1, 1.0, np.nan], rtol=0, atol=1e-9)
+
+
+def test_points_behind_a_wall_are_seen_by_the_frames_beyond_it_only(rendered: Path, tmp_path: Path) -> None:
+    """A wall from north to south on a level truth; rays are followed by the rule of three instead of step by step."""
+    wall_m, borderline_m = 15.0, 0.4
+    scene = Path(shutil.copytree(rendered, tmp_path / "block"))
+    with rasterio.open(scene / "truth_dsm.tif", "r+") as file:
+        n_cols, level_m = file.width, float(np.nanmean(file.read(1)))
+        wall_col = n_cols // 4
+        heights = np.full((file.height, n_cols), level_m, np.float32)
+        wall_x = (file.transform * (wall_col + 0.5, 0))[0]
+        heights[:, wall_col] += wall_m
+        file.write(heights, 1)
+        rows, cols = (axis.ravel() for axis in np.mgrid[4 : file.height : 9, 3:n_cols:7])
+        xyz = np.column_stack([*(file.transform * (cols + 0.5, rows + 0.5)), np.full(len(rows), level_m)])
+    top = level_m + wall_m
+    inside_of, expected = np.zeros(len(xyz), int), np.zeros(len(xyz), int)
+    is_clear = np.abs(xyz[:, 0] - wall_x) > borderline_m
+    for view in row.open_scene([scene / "scene.yaml"]).views:
+        xy, centre = view.sensor.image_from_ground(xyz), view.sensor.centre
+        inside = ((xy >= 0) & (xy <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
+        share = (wall_x - xyz[:, 0]) / (centre[0] - xyz[:, 0])
+        at_wall = xyz[:, 2] + share * (centre[2] - xyz[:, 2])
+        is_between = (share > 0) & (share < 1)
+        inside_of += inside
+        expected += inside & ~(is_between & (at_wall < top))
+        is_clear &= ~is_between | (np.abs(at_wall - top) > borderline_m)
+    found = row.n_frames_that_see(scene, xyz)
+    np.testing.assert_array_equal(found[is_clear], expected[is_clear])
+    assert ((found < inside_of) & is_clear).sum() > 10
