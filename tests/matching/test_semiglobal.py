@@ -186,10 +186,10 @@ def test_the_penalty_of_one_step(p1, n_images, expected):
 
 @pytest.mark.parametrize(
     ("n_images", "step_cells", "expected"),
-    [(2, 1.5, 100), (2, 4.0, 100), (2, 0.75, 25), (3, 1.2, 36), (3, 0.9, 27), (9, 0.9, 27), (9, 0.6, 16)],
+    [(2, 1.35, 100), (2, 4.0, 100), (2, 0.675, 25), (3, 1.2, 45), (3, 0.9, 40), (9, 0.9, 40), (9, 0.6, 20)],
 )
 def test_low_height_steps_cost_less(n_images, step_cells, expected):
-    # 100 (0.75 / 1.5)^2 = 25; the least P1 of many images at 0.9 cells is 45 * 0.9 / 1.5 = 27.
+    # 100 (0.675 / 1.35)^2 = 25; the least P1 of many images at 0.9 cells is 45 * 0.9 = 40.5. That of two at 0.6 is 20.
     assert penalty_of_one_step(100, n_images, step_cells) == expected
 
 
@@ -201,8 +201,8 @@ def test_a_penalty_of_one_step_that_is_set_does_not_follow_the_height_of_a_step(
     unset, as_set = (replace(OPTIONS, predecessors=predecessors, p1=p1) for p1 in (None, 100))
     found = {
         (name, step): aggregate(cost, lattice, p2, step, options).uniqueness
-        for name, options in (("unset", unset), ("set", as_set)) for step in (0.75, 1.5)
+        for name, options in (("unset", unset), ("set", as_set)) for step in (0.75, 1.35)
     }  # fmt: skip
-    np.testing.assert_array_equal(found["set", 0.75], found["set", 1.5])
-    np.testing.assert_array_equal(found["set", 1.5], found["unset", 1.5])
-    assert (found["unset", 0.75] != found["unset", 1.5]).any()
+    np.testing.assert_array_equal(found["set", 0.75], found["set", 1.35])
+    np.testing.assert_array_equal(found["set", 1.35], found["unset", 1.35])
+    assert (found["unset", 0.75] != found["unset", 1.35]).any()

@@ -20,8 +20,9 @@ from zlocus.matching.occlusion import PAIR
 PATHS = 4  # from W, NW, N and NE; as many come from the other side
 # P1 is divided by the number of images less one, but is not below this: many images err together.
 LEAST_P1 = 45
-# The defaults of P1 are those of height steps of so many cells, or more: those of satellite images.
-USUAL_STEP_CELLS = 1.5
+# The default of P1 for two images is that of height steps of so many cells, or more: those of satellite images. The
+# least P1 of many images holds for steps of a cell or more.
+USUAL_STEP_CELLS, LEAST_STEP_CELLS = 1.35, 1.0
 # Cells that only two images cover ask for so many times the contrast of an edge that opens a jump.
 PAIR_CONTRAST = np.float32(4.0)
 
@@ -122,10 +123,10 @@ def penalty_of_one_step(p1: int, n_images: float, step_cells: float = USUAL_STEP
 
     Where the base is wide, a step is lower than a cell: the same slope takes more steps, and each of them says less.
     P1 decreases with the square of the height of a step, as the logarithm of a normal distribution of slopes does, and
-    its least value with that height.
+    its least value with that height, below LEAST_STEP_CELLS.
     """
-    share = min(step_cells / USUAL_STEP_CELLS, 1.0)
-    of_two, least = round(p1 * share**2), round(LEAST_P1 * share)
+    of_two = round(p1 * min(step_cells / USUAL_STEP_CELLS, 1.0) ** 2)
+    least = round(LEAST_P1 * min(step_cells / LEAST_STEP_CELLS, 1.0))
     return min(max(round(of_two / max(n_images - 1.0, 1.0)), least), of_two)
 
 

@@ -17,8 +17,8 @@ class SemiGlobalOptions(Checked):
     )  # fmt: skip
     p1: int | None = option_by_method(
         100, 20, "Penalty P1 of a height difference of one step between neighbours that two images see. Match curves "
-        "of n images are less noisy: there it is divided by n - 1, but not below 45. Where it is unset and a height "
-        "step is lower than 1.5 cells, it decreases with the square of the step's height, and the 45 with the height.",
+        "of n images are less noisy: there it is divided by n - 1, but not below 45. Where it is unset, it "
+        "decreases with the square of the height of a step below 1.35 cells, and the 45 with that height below 1 cell.",
         low=0, high=1000,
     )  # fmt: skip
     p2: int | None = option_by_method(
