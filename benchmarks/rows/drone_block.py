@@ -225,7 +225,7 @@ def _figures(errors: np.ndarray, classes: np.ndarray, limit_m: float) -> list[Fi
     return [
         *figures,
         Figure(
-            "seen by two frames, filled", complete, at_least=LEAST_FILLED,
+            "filled", complete, at_least=LEAST_FILLED,
             fails_when="heights are refused where two frames agree, or views are left out of blocks",
         ),
         Figure(f"off by more than {last:g} m", complete - shares["all"][last]),

@@ -83,7 +83,7 @@ def test_the_row_renders_matches_and_judges(
     has_height, is_wrong, is_off = y >= middle[1] - EMPTY_FROM_M, y > middle[1] + WRONG_FROM_M, x < middle[0]
     assert spec.ground_pixel_m * 2 < OFF_M < 1.0
     assert 0.05 < is_wrong.mean() < has_height.mean() < 0.95
-    assert values["seen by two frames, filled"] == pytest.approx(has_height.mean(), abs=SHARE)
+    assert values["filled"] == pytest.approx(has_height.mean(), abs=SHARE)
     assert values["off by more than 3 m"] == pytest.approx(is_wrong.mean(), abs=SHARE)
     is_right = has_height & ~is_wrong & ~is_off
     assert values["within two ground pixels: all"] == pytest.approx(is_right.mean(), abs=SHARE)

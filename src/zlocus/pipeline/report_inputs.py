@@ -163,7 +163,7 @@ def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[s
     """
     match_scene, start = run.match_scene, time.perf_counter()
     is_new, parts = np.ones(len(match_scene.ties), bool), list[LabelledTies]()
-    for core in sample_cores(match_scene, SAMPLE_BLOCKS * config.pyramid.block):
+    for core in sample_cores(match_scene, SAMPLE_BLOCKS * config.pyramid.block, math.ceil(config.selection.radius_px)):
         if parts and time.perf_counter() - start > most_s:
             break
         tile_labels = rank_tile(match_scene, core, config)
@@ -179,8 +179,12 @@ def sampled_labels(run: ReportedRun, config: RunConfig, most_s: float) -> dict[s
     return {"points": n_points, "pairs": counted_pairs(label_counts(parts, len(names)), names)}
 
 
-def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
-    """Windows of `side` cells around tie points spread over the scene; each lies far from the earlier ones."""
+def sample_cores(match_scene: MatchScene, side: int, reach: int) -> list[CellWindow]:
+    """Windows of `side` cells around tie points spread over the scene; each lies far from the earlier ones.
+
+    reach : tie points are labelled up to this many cells beyond a window. Where the windows with their reach have more
+    cells than the scene, the scene is the only window.
+    """
     xy = (match_scene.ties[:, :2] - match_scene.anchor) * (1.0, -1.0) / match_scene.cell_size
     first, size = (
         (match_scene.overlap_window.col, match_scene.overlap_window.row),
@@ -197,6 +201,8 @@ def sample_cores(match_scene: MatchScene, side: int) -> list[CellWindow]:
     order = [nearest[len(nearest) // 2]]
     while rest := [tie for tie in nearest if tie not in order]:
         order.append(max(rest, key=lambda tie: min(float(np.hypot(*(xy[tie] - xy[old]))) for old in order)))
+    if len(order) * (side + 2 * reach) ** 2 >= match_scene.overlap_window.rows * match_scene.overlap_window.cols:
+        return [match_scene.overlap_window]
     cells = np.floor(xy[order]).astype(int) - side // 2
     return [CellWindow(int(row), int(col), side, side).within(match_scene.overlap_window) for col, row in cells]
 

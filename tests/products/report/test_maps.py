@@ -184,7 +184,7 @@ def scene_with(xy: np.ndarray):
 def test_places_of_a_sample_are_spread_and_inside():
     xy = np.random.default_rng(2).uniform((0, 0), (1000, 800), (3000, 2))
     xy[:20] += 5000.0  # beyond the ground that two images see
-    cores = sample_cores(scene_with(xy), 64)
+    cores = sample_cores(scene_with(xy), 64, 16)
     assert len(cores) == 9
     middle = np.array([(core.col + 32, core.row + 32) for core in cores])
     apart = np.hypot(*(middle[:, None] - middle[None]).transpose(2, 0, 1))
@@ -195,10 +195,16 @@ def test_places_of_a_sample_are_spread_and_inside():
 
 
 def test_few_ties_give_few_places():
-    assert len(sample_cores(scene_with(np.array([(10.0, 10.0)])), 64)) == 1
-    assert sample_cores(scene_with(np.zeros((0, 2))), 64) == []
-    only = sample_cores(scene_with(np.array([(10.0, 10.0)])), 64)[0]
+    assert len(sample_cores(scene_with(np.array([(10.0, 10.0)])), 64, 16)) == 1
+    assert sample_cores(scene_with(np.zeros((0, 2))), 64, 16) == []
+    only = sample_cores(scene_with(np.array([(10.0, 10.0)])), 64, 16)[0]
     assert (only.row, only.col, only.rows, only.cols) == (0, 0, 42, 42)
+
+
+def test_a_scene_smaller_than_all_places_is_one_place():
+    xy = np.random.default_rng(2).uniform((0, 0), (1000, 800), (3000, 2))
+    assert sample_cores(scene_with(xy), 64, 118) == [CellWindow(0, 0, 800, 1000)]  # nine times 300 x 300 cells
+    assert len(sample_cores(scene_with(xy), 64, 117)) == 9
 
 
 def card(kind: str, why: str, rho1: float) -> list[str]:

@@ -22,9 +22,9 @@ from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMID
 # Time to match a cell of a core, and in addition for each view that may show it
 # (docs/development/experiments/growth.md, docs/development/experiments/close_cameras.md).
 CELL_S, VIEW_CELL_S = 2e-6, 3e-6
-# Peak memory of a tile: for each cell; for each cell and height step; for each cell and view that is compared; for each
-# pixel that those views show of the cells.
-CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 150, 3, 38, 9
+# Peak memory of a tile: for each cell; for each cell and height step; for each cell and view that shows it; for each
+# pixel that the views show of the cells (docs/development/experiments/growth.md).
+CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 65, 3, 23, 12
 STEPS_PER_CELL = 48
 # Memory of the reduced parts of an image for each of its pixels: five bytes for each pixel of a level.
 REDUCED_BYTES = 5 / 4**FIRST_KEPT_LEVEL * 4 / 3
@@ -90,8 +90,8 @@ def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig
             tile.core_window, 0, config.pyramid.halo, config.pyramid.block, match_scene.overlap_window
         )  # fmt: skip
         cells, shown = fine.rows * fine.cols, _shown_pixels(match_scene, tile.core_window, fine, config)
-        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * len(shown.pixels)
-        most = max(most, cells * per_cell + sum(shown.pixels) * PIXEL_BYTES)
+        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * shown.views_of_cell
+        most = max(most, int(cells * per_cell + sum(shown.pixels) * PIXEL_BYTES))
         seconds += tile.core_window.rows * tile.core_window.cols * (CELL_S + VIEW_CELL_S * shown.views_of_cell)
     return TileNeeds(most, seconds * len(worked) / max(len(looked), 1))
 
