@@ -223,6 +223,7 @@ def test_tables_of_realistic_scenes(found, tmp_path, monkeypatch):
         for views in ("two", "three")
         for what, value in zip(whats, (1.0, 0.5, 0.25), strict=True)
     )
+    figures += (Figure("peak memory by its plan, least", 0.9),)  # of the runs, no trouble
     of_troubles = Results("troubles", "abc", "2026", {}, "make", None, {}, figures)
     assert scene_tables.troubles({"troubles": of_troubles}).splitlines()[2:] == [
         "| lake | 1.00 / 0.50 / 0.25 | 1.00 / 0.50 / 0.25 |"
