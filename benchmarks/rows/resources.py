@@ -99,16 +99,23 @@ def of_all_processes(record: dict[str, Any], at_most_gb: float | None = None) ->
     ]  # fmt: skip
 
 
+def _is_peak_its_own(record: dict[str, Any]) -> bool:
+    """Whether the process of a run reached its largest memory after the first stage of the run."""
+    peaks = [stage["peak_mb"] for stage in record["stages"]]
+    return bool(peaks[0] < max(peaks))
+
+
 def peaks_by_plan(folder: Path) -> list[Figure]:
     """The largest memory of a process divided by what its run had planned: least and largest of the runs in a folder.
 
-    Runs of the cluster are not counted, nor those of other programs and earlier versions, whose records hold no plan.
+    Runs of the cluster are not counted, nor those of other programs and earlier versions, whose records hold no plan,
+    nor a run in a process that needed as much memory for an earlier run: its own peak is not known.
     """
     records = [json.loads(path.read_text()) for path in sorted(folder.rglob("run.json"))]
     shares = [
         max(stage["peak_mb"] for stage in record["stages"]) / record["plan"]["process_mb"]
         for record in records
-        if "plan" in record and not record["config"]["request"].get("scheduler")
+        if "plan" in record and not record["config"]["request"].get("scheduler") and _is_peak_its_own(record)
     ]
     if not shares:
         return []

@@ -84,9 +84,13 @@ def test_a_row_of_the_acceptance_table(small_data, tmp_path, monkeypatch, capsys
 
 
 def test_the_memory_of_runs_is_held_against_their_plans(tmp_path):
-    """By the process that takes most; records of other programs hold no plan."""
+    """By the process that takes most. Records of other programs hold no plan, and the third run does not know its peak,
+    because its process had taken as much before."""
     request = {"config": {"request": {"scheduler": None}}}
-    for name, peaks_mb, plan_mb in (("one", (200.0, 900.0), 1000.0), ("deep/two", (1300.0, 100.0), 1000.0)):
+    runs = (
+        ("one", (200.0, 900.0), 1000.0), ("deep/two", (100.0, 1300.0, 200.0), 1000.0), ("three", (700.0, 700.0), 100.0)
+    )  # fmt: skip
+    for name, peaks_mb, plan_mb in runs:
         (tmp_path / name).mkdir(parents=True)
         stages = [{"name": "match", "peak_mb": peak} for peak in peaks_mb]
         record = request | {"stages": stages, "plan": {"process_mb": plan_mb, "memory_mb": 3000.0}}

@@ -129,7 +129,10 @@ def test_dsm_reads_its_configuration(zl, pipeline, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["a.tif"], "two images or more"),
+        (["a.tif"], "There is no file a.tif"),
+        ([__file__], "two images or more"),
+        (["."], ". is a folder. It holds no image"),
+        (["a.tif", "?.tif"], "No file matches ?.tif"),
         (["a.tif", "a.tif"], "given twice"),
         (["a.tif", "scene.yaml"], "must be the only input"),
         (["a.tif", "b.tif", "--resolution", "0"], "--resolution 0"),
@@ -220,13 +223,12 @@ def test_every_error_has_its_exit_status(zl, pipeline, tmp_path, error, status):
     assert result.exit_code == status
     sentence = one_sentence(result)
     assert ("what, where, what to do." in sentence) == (error is not KeyboardInterrupt)
-    assert ("ZLOCUS_DEBUG" in sentence) == (status == 1)
+    assert ("--verbose" in sentence) == (status == 1)
 
 
-def test_debug_shows_the_trace(zl, pipeline, tmp_path, monkeypatch):
-    monkeypatch.setenv("ZLOCUS_DEBUG", "1")
+def test_verbose_shows_the_trace(zl, pipeline, tmp_path):
     pipeline.behave = lambda: 1 / 0
-    assert "Traceback" in zl("dsm", "a.tif", "b.tif", "-o", tmp_path / "out").stderr
+    assert "Traceback" in zl("dsm", "a.tif", "b.tif", "-o", tmp_path / "out", "--verbose").stderr
 
 
 def test_demo_prints_accuracy_and_may_be_repeated(zl, pipeline, tmp_path, monkeypatch):

@@ -6,21 +6,24 @@ once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 
 from zlocus import __version__
 from zlocus.cli.cloud import CloudOptions, cloud
-from zlocus.cli.commands import command_of
+from zlocus.cli.commands import Command, command_of
 from zlocus.cli.config import ConfigOptions, config
+from zlocus.cli.console import Console, OutputOptions
 from zlocus.cli.curves import CurvesOptions, curves
 from zlocus.cli.demo import DemoOptions, demo
 from zlocus.cli.doctor import DoctorOptions, doctor
 from zlocus.cli.dsm import DsmOptions, dsm
 from zlocus.cli.evaluate import EvaluateOptions, evaluate
 from zlocus.cli.exit_status import show_our_warnings
+from zlocus.cli.help_text import EXAMPLES, GroupedHelp, short_help
 from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
 from zlocus.cli.orient import OrientOptions, TiesOptions, orient, ties
@@ -32,7 +35,7 @@ from zlocus.core.signals import handle_signals
 from zlocus.core.startup import prepare
 
 # Commands in the order in which `zlocus --help` lists them: name, options, function.
-COMMANDS: tuple[tuple[str, type[Any], Callable[[Any], None]], ...] = (
+COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("demo", DemoOptions, demo),
     ("dsm", DsmOptions, dsm),
     ("products", ProductsOptions, products),
@@ -54,13 +57,14 @@ app = typer.Typer(
     name="zlocus",
     help="Digital surface models from images, by multi-view vertical line locus matching.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for name, options, run in COMMANDS:
-    app.command(name)(command_of(options, run))
+    app.command(name, cls=GroupedHelp, epilog=EXAMPLES.get(name), short_help=short_help(run))(
+        command_of(name, options, run)
+    )
 
 
 def _print_version(wanted: bool) -> None:
@@ -83,4 +87,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     handle_signals()
     prepare()
     show_our_warnings()
-    app(arguments, prog_name="zlocus")
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        status = app(words, prog_name="zlocus", standalone_mode=False)
+    except Exception as error:
+        # The class of usage errors is private in Typer; they know how to show themselves.
+        usage: Any = error
+        if not hasattr(error, "show"):
+            raise
+        usage.show()
+        if "--json" in words:
+            Console(words[0], OutputOptions(as_json=True)).failed(usage.format_message(), usage.exit_code)
+        status = usage.exit_code
+    sys.exit(status or 0)

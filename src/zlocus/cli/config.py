@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
+from zlocus.cli.console import Console
 from zlocus.core.errors import OutputError
 
 
@@ -18,16 +20,15 @@ class ConfigOptions:
     out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Without it, or with -, print.")] = None
 
 
-def config(options: ConfigOptions) -> None:
+def config(options: ConfigOptions, console: Console) -> Answer:
     """Write a configuration with a comment for every option."""
     from zlocus.core.options import RunConfig
     from zlocus.io.atomic_write import atomic_file
-    from zlocus.io.config import write_config
+    from zlocus.io.config import config_as_dict, write_config
 
-    text, out = write_config(RunConfig()), options.out
+    text, out, values = write_config(RunConfig()), options.out, {"options": config_as_dict(RunConfig())}
     if out is None or str(out) == "-":
-        print(text, end="")
-        return
+        return Answer(text.rstrip("\n"), values, is_asked_for=True)
     if out.exists():
         raise OutputError(f"{out} exists already and may hold your settings. Choose another name with -o.")
     try:
@@ -35,3 +36,4 @@ def config(options: ConfigOptions) -> None:
             part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{out} cannot be written: {error.strerror}. Choose another name with -o.") from error
+    return Answer(f"{out}: every option with its default and a comment.", values)

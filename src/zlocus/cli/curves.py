@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
-from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Overwrite, Resolution, TieHeights
-from zlocus.core.progress import progress_for
+from zlocus.cli.console import Console
+from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Overwrite, Resolution, Settings, TieHeights
 from zlocus.core.requests import CurvesRequest, check_output
 
 
@@ -40,9 +40,10 @@ class CurvesOptions:
     ] = None
     overwrite: Overwrite = False
     config: ConfigFile = None
+    settings: Settings = None
 
 
-def curves(options: CurvesOptions) -> None:
+def curves(options: CurvesOptions, console: Console) -> Answer:
     """Show the match curves of one point.
 
     Give the point with --at or --pixel. The text and figures show how distinct the peak of each image is, in which
@@ -54,7 +55,10 @@ def curves(options: CurvesOptions) -> None:
         overwrite=options.overwrite,
     )  # fmt: skip
     check_output(request.out, request.overwrite)
-    config = config_of(options.config)
+    config = config_of(options.config, options.settings)
+    from zlocus.io.run_record import read_record
     from zlocus.pipeline.match_curves import run_curves
+    from zlocus.products.match_curve_figures import POINT
 
-    print(run_curves(request, config, progress_for(sys.stderr)))
+    text = run_curves(request, config, console.progress)
+    return Answer(text, {"point": read_record(request.out / POINT)}, is_asked_for=True)

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
+from zlocus.cli.console import Console
 from zlocus.cli.products import PRODUCTS_HELP
 from zlocus.cli.shared_options import (
+    AREA_AND_GRID,
+    HEIGHTS,
+    MATCHING,
+    RESULT,
+    RUN,
     Area,
     Bounds,
     ConfigFile,
     Crs,
     DemVertical,
+    DryRun,
     Inputs,
     Memory,
     Overwrite,
@@ -25,9 +32,9 @@ from zlocus.cli.shared_options import (
     ResultFolder,
     Resume,
     SearchedHeights,
+    Settings,
     Vertical,
 )
-from zlocus.core.progress import progress_for
 from zlocus.core.requests import (
     DEFAULT_PRODUCTS,
     METHODS,
@@ -48,24 +55,36 @@ class DsmOptions:
     crs: Crs = None
     bounds: Bounds = None
     like: Annotated[
-        Path | None, typer.Option(help="Take CRS, transform and shape from a raster.", metavar="RASTER")
+        Path | None,
+        typer.Option(
+            help="Take CRS, transform and shape from a raster.", metavar="RASTER", rich_help_panel=AREA_AND_GRID
+        ),
     ] = None
     area: Area = None
-    mask: Annotated[Path | None, typer.Option(help="Match nothing inside these polygons.", metavar="VECTOR")] = None
+    mask: Annotated[
+        Path | None,
+        typer.Option(help="Match nothing inside these polygons.", metavar="VECTOR", rich_help_panel=AREA_AND_GRID),
+    ] = None
     heights: SearchedHeights = None
-    dem: Annotated[Path | None, typer.Option(help="Search only near the heights of a raster.", metavar="RASTER")] = None
+    dem: Annotated[
+        Path | None,
+        typer.Option(help="Search only near the heights of a raster.", metavar="RASTER", rich_help_panel=HEIGHTS),
+    ] = None
     dem_vertical: DemVertical = None
     reference: Annotated[
         str | None,
         typer.Option(
             help="Reference image, which sets height step and image order. With gc3-sgm: match only its pixels.",
             metavar="VIEW",
+            rich_help_panel=MATCHING,
         ),
     ] = None
     views: Annotated[
         str,
         typer.Option(
-            help="Images considered for a cell: the best candidates that show its tile, or all.", metavar="auto|all"
+            help="Images considered for a cell: the best candidates that show its tile, or all.",
+            metavar="auto|all",
+            rich_help_panel=MATCHING,
         ),
     ] = "auto"
     method: Annotated[
@@ -74,6 +93,7 @@ class DsmOptions:
             help="Matching: ground grid (mvll) or image space (gc3), with or without semi-global constraint. "
             "Default: mvll-sgm; mvll with --selection paper.",
             metavar="mvll-sgm|mvll|gc3-sgm|gc3",
+            rich_help_panel=MATCHING,
         ),
     ] = None
     selection: Annotated[
@@ -82,29 +102,42 @@ class DsmOptions:
             help="Images used for a cell: all that are considered; a few, chosen by match curves at tie points; or "
             "those of Ji et al. (2014).",
             metavar="default|guided|paper",
+            rich_help_panel=MATCHING,
         ),
     ] = "default"
     vertical: Vertical = "ellipsoid"
     fill: Annotated[
         str,
         typer.Option(
-            help="Fill gaps: small ones by interpolation, or all from the DEM.", metavar="none|interpolate|dem"
+            help="Fill gaps: small ones by interpolation, or all from the DEM.",
+            metavar="none|interpolate|dem",
+            rich_help_panel=RESULT,
         ),
     ] = "none"
     partial: Partial = False
     workers: Annotated[
         int | None,
-        typer.Option(help="Tiles worked on at a time. Default: as cores, memory and work allow.", metavar="N"),
+        typer.Option(
+            help="Tiles worked on at a time. Default: as cores, memory and work allow.",
+            metavar="N",
+            rich_help_panel=RUN,
+        ),
     ] = None
-    scheduler: Annotated[str | None, typer.Option(help="Dask cluster that matches the tiles.", metavar="ADDRESS")] = (
-        None
-    )
+    scheduler: Annotated[
+        str | None, typer.Option(help="Dask cluster that matches the tiles.", metavar="ADDRESS", rich_help_panel=RUN)
+    ] = None
     memory: Memory = None
     resume: Resume = True
-    maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST")] = ",".join(DEFAULT_PRODUCTS)
+    maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST", rich_help_panel=RESULT)] = (
+        ",".join(DEFAULT_PRODUCTS)
+    )
     overwrite: Overwrite = False
-    report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.")] = True
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.", rich_help_panel=RESULT)] = (
+        True
+    )
     config: ConfigFile = None
+    settings: Settings = None
+    dry_run: DryRun = False
 
 
 def method_of(options: DsmOptions) -> str:
@@ -112,7 +145,7 @@ def method_of(options: DsmOptions) -> str:
     return options.method or METHODS_OF_SELECTION.get(options.selection, METHODS)[0]
 
 
-def dsm(options: DsmOptions) -> None:
+def dsm(options: DsmOptions, console: Console) -> Answer:
     """Make a digital surface model from images."""
     request = DsmRequest(
         inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
@@ -124,9 +157,17 @@ def dsm(options: DsmOptions) -> None:
         resume=options.resume, products=product_names(options.maps), report=options.report,
     )  # fmt: skip
     check_output(request.out, request.overwrite, may_be_same=True)
-    config = config_of(options.config)
+    config = config_of(options.config, options.settings)
+    if options.dry_run:
+        from zlocus.pipeline.dry_run import plan_dsm
+
+        dry = plan_dsm(request, config, console.progress)
+        return Answer(dry.text, dry.values, is_asked_for=True)
     from zlocus.pipeline.dsm import run_dsm
 
-    result = run_dsm(request, config, progress_for(sys.stderr))
+    result = run_dsm(request, config, console.progress)
     state = "already finished, " if result.was_finished else ""
-    print(f"{result.out}: {state}{100 * result.coverage:.1f} % of the cells seen by two images or more have a height.")
+    return Answer(
+        f"{result.out}: {state}{100 * result.coverage:.1f} % of the cells seen by two images or more have a height.",
+        {"coverage": result.coverage, "was_finished": result.was_finished},
+    )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from zlocus.cli.answer import Answer
+from zlocus.cli.console import Console
 from zlocus.core.errors import ConfigError
 from zlocus.core.requests import EVALUATION_FILES, check_output
 
@@ -94,10 +95,9 @@ class EvaluateOptions(ComparisonOptions):
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another evaluation in the output folder.")] = (
         False
     )
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
 
 
-def evaluate(options: EvaluateOptions) -> None:
+def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     """Compare a surface with a reference surface."""
     arguments = options.arguments()
     if options.out is not None:
@@ -111,7 +111,7 @@ def evaluate(options: EvaluateOptions) -> None:
     evaluation = compare(options.dsm, Comparison(options.reference, **arguments))
     if options.out is not None:
         write_evaluation(options.out, evaluation)
-    print(json.dumps(evaluation.as_dict(), indent=2) if options.as_json else evaluation_table(evaluation))
+    return Answer(evaluation_table(evaluation), evaluation.as_dict(), is_asked_for=True)
 
 
 def check_not_input(out: Path, *inputs: Path | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import os
+import logging
 import shutil
 import signal
 import sys
@@ -15,51 +15,58 @@ from typing import Any, ParamSpec, TypeVar
 
 import typer
 
+from zlocus.cli.console import Console
 from zlocus.core.errors import ZlocusError, ZlocusWarning
 from zlocus.core.parallel import is_busy
 from zlocus.core.signals import Ended, end_children, ended_by_signals, exit_status, leave, sentence_of
 
 EXIT_OWN_FAULT = 1
+LOGGER = logging.getLogger("zlocus")
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def explained(command: Callable[P, R]) -> Callable[P, R]:
-    """A command whose errors become one sentence on stderr and an exit status (ZLOCUS_DEBUG=1: the trace too)."""
+def explained(command: Callable[P, R], console: Console | None = None) -> Callable[P, R]:
+    """A command whose errors become one sentence on stderr and an exit status.
+
+    console : of the command, which gets each error too; where it is verbose, the trace is printed.
+    """
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return ended_by_signals(command, *args, **kwargs)
         except ZlocusError as error:
-            raise _failed(str(error), error.exit_status) from error
+            raise _failed(str(error), error.exit_status, console) from error
         except KeyboardInterrupt as error:
-            raise _interrupted(error) from error
+            raise _interrupted(error, console) from error
         except (typer.Exit, BrokenPipeError):
             raise
         except Exception as error:
             what = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
-            advice = "This is a fault of zlocus, not of the input; set ZLOCUS_DEBUG=1 to see the trace, and report it."
-            raise _failed(f"Unexpected {what}. {advice}", EXIT_OWN_FAULT) from error
+            advice = "This is a fault of zlocus, not of the input; see the trace with --verbose, and report it."
+            raise _failed(f"Unexpected {what}. {advice}", EXIT_OWN_FAULT, console) from error
 
     return run
 
 
-def _failed(sentence: str, status: int) -> typer.Exit:
-    if os.environ.get("ZLOCUS_DEBUG"):
+def _failed(sentence: str, status: int, console: Console | None) -> typer.Exit:
+    if console is not None and console.is_verbose:
         traceback.print_exc()
     _say(f"zlocus: {sentence}")
+    if console is not None:
+        console.failed(sentence, status)
     return typer.Exit(status)
 
 
-def _interrupted(error: KeyboardInterrupt) -> typer.Exit:
+def _interrupted(error: KeyboardInterrupt, console: Console | None) -> typer.Exit:
     """What a command ends with after a signal. Its processes are killed, and its threads are not waited for: nothing is
     half-written then, for threads only compute."""
     number = error.number if isinstance(error, Ended) else int(signal.SIGINT)
     if isinstance(error, Ended):
         end_children()
     try:
-        failed = _failed(sentence_of(number), exit_status(number))
+        failed = _failed(sentence_of(number), exit_status(number), console)
     except OSError:  # the terminal has gone
         leave(exit_status(number))
     if is_busy():
@@ -82,6 +89,8 @@ def show_our_warnings() -> None:
     def show_warning(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
         if issubclass(category, ZlocusWarning):
             _say(f"zlocus: {message}")
+            if LOGGER.hasHandlers():
+                LOGGER.warning("zlocus: %s", message)
         else:
             show(message, category, *args, **kwargs)
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
+from zlocus.cli.console import Console
 from zlocus.core.requests import ImportRequest
 
 
@@ -48,10 +50,10 @@ class ImportOptions:
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the scene file.")] = False
 
 
-def import_cameras(options: ImportOptions) -> None:
+def import_cameras(options: ImportOptions, console: Console) -> Answer:
     """Write a scene.yaml from the cameras of another program."""
     request = ImportRequest(**vars(options))
     from zlocus.io.importers.scene import import_scene
 
     scene = import_scene(request)
-    print(f"{request.out}: {len(scene.views)} views.")
+    return Answer(f"{request.out}: {len(scene.views)} views.", {"views": [view.name for view in scene.views]})

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
+from zlocus.cli.console import Console
 from zlocus.cli.evaluate import Align, Coregister, Geoid, Margin
 from zlocus.cli.report import check_reference
 from zlocus.cli.shared_options import Reference, SurfaceFolderArgument
@@ -38,7 +40,7 @@ class InspectOptions:
     open_it: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False
 
 
-def inspect(options: InspectOptions) -> None:
+def inspect(options: InspectOptions, console: Console) -> None:
     """Look at a surface in the browser, cell by cell."""
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise ConfigError(
@@ -59,9 +61,11 @@ def inspect(options: InspectOptions) -> None:
         )  # fmt: skip
 
     def announce(address: str, is_open_to_others: bool) -> None:
+        text = f"{address}\nOpen it in a browser; Ctrl-C ends it."
         if is_open_to_others:
-            print("Whoever can reach this machine and knows this address can look at the surface and its images:")
-        print(f"{address}\nOpen it in a browser; Ctrl-C ends it.", flush=True)
+            warning = "Whoever can reach this machine and knows this address can look at the surface and its images:"
+            text = f"{warning}\n{text}"
+        console.answer(Answer(text, {"address": address}, is_asked_for=True))
         if options.open_it:
             webbrowser.open(address)
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
-from zlocus.cli.shared_options import ConfigFile, Crs, Overwrite, Resolution, TieHeights
+from zlocus.cli.console import Console
+from zlocus.cli.shared_options import ConfigFile, Crs, Overwrite, Resolution, Settings, TieHeights
 from zlocus.core.paper_request import PaperRequest
-from zlocus.core.progress import progress_for
 from zlocus.core.requests import check_output
 
 
@@ -61,9 +61,10 @@ class PaperOptions:
     heights: TieHeights = None
     overwrite: Overwrite = False
     config: ConfigFile = None
+    settings: Settings = None
 
 
-def paper(options: PaperOptions) -> None:
+def paper(options: PaperOptions, console: Console) -> Answer:
     """Make a table or figure of Ji et al. (2014).
 
     FIGURE is table3, table4, or one of figure3 to figure8. Images are chosen, and points are matched, literally as the
@@ -76,7 +77,8 @@ def paper(options: PaperOptions) -> None:
         overwrite=options.overwrite,
     )  # fmt: skip
     check_output(request.out, request.overwrite, request.files, request.what)
-    config = config_of(options.config)
+    config = config_of(options.config, options.settings)
     from zlocus.pipeline.paper import run_paper
 
-    print(run_paper(request, config, progress_for(sys.stderr)))
+    text = run_paper(request, config, console.progress)
+    return Answer(text, {"what": request.what, "files": list(request.files)}, is_asked_for=True)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from zlocus.cli.shared_options import SurfaceFolderArgument
+from zlocus.cli.answer import Answer
+from zlocus.cli.commands import config_of
+from zlocus.cli.console import Console
+from zlocus.cli.shared_options import Settings, SurfaceFolderArgument
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import ProductOptions
-from zlocus.core.progress import progress_for
 from zlocus.core.requests import PRODUCTS, check_output, product_names
 
 PRODUCTS_HELP = f"Maps to make: {', '.join(PRODUCTS)} (separated by commas), or none."
@@ -28,30 +30,34 @@ class ProductsOptions:
         Path | None,
         typer.Option(help="File with options of every stage. Default: those of the run.", metavar="FILE"),
     ] = None
+    settings: Settings = None
 
 
-def products(options: ProductsOptions) -> None:
+def products(options: ProductsOptions, console: Console) -> Answer:
     """Make maps of a finished surface, replacing earlier ones."""
     chosen = product_names(options.names)
     check_output(options.out, overwrite=True)
-    from zlocus.io.config import read_config
     from zlocus.io.open_raster import existing_file
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import FILES, link_all, write_derived
 
     existing_file(options.out / "dsm.tif", "surface")
-    product_options = (
-        run_options(options.out / "run.json") if options.config is None else read_config(options.config).products
-    )
-    progress = progress_for(sys.stderr)
+    if options.config is None:
+        product_options = run_options(options.out / "run.json", options.settings or ())
+    else:
+        product_options = config_of(options.config, options.settings).products
+    progress = console.progress
     write_derived(options.out, chosen, product_options, progress)
     link_all(options.out, progress)
     update_finished(options.out, (*(FILES[name] for name in chosen), ITEM))
-    print(f"{options.out}: {', '.join(FILES[name] for name in chosen) or 'no map'} made.")
+    made = [FILES[name] for name in chosen]
+    return Answer(f"{options.out}: {', '.join(made) or 'no map'} made.", {"products": made})
 
 
-def run_options(record: Path) -> ProductOptions:
+def run_options(record: Path, settings: Sequence[str]) -> ProductOptions:
     """The product options with which a run was made, from its run.json; the default ones where there is none.
+
+    settings : of --set, in place of single ones.
 
     Raises
     ------
@@ -60,15 +66,15 @@ def run_options(record: Path) -> ProductOptions:
     ConfigError
         It holds options that are none here.
     """
-    from zlocus.io.config import config_from_dict
     from zlocus.io.run_record import read_record
+    from zlocus.io.settings import config_with_settings, with_settings
 
     if not record.exists():
-        return ProductOptions()
+        return config_with_settings(None, settings).products
     found: Any = read_record(record)
     for name in ("config", "options", "products"):
         found = found.get(name, {}) if isinstance(found, dict) else {}
     try:
-        return config_from_dict({"products": found}, str(record)).products
+        return with_settings({"products": found}, str(record), settings).products
     except ConfigError as error:
         raise ConfigError(f"{error} Or give the options with --config.") from error

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from zlocus.cli.answer import Answer
+from zlocus.cli.console import Console
 from zlocus.cli.evaluate import ComparisonOptions
 from zlocus.cli.shared_options import Reference, SurfaceFolderArgument
 from zlocus.core.errors import ConfigError
@@ -19,7 +21,7 @@ class ReportOptions(ComparisonOptions):
     reference: Reference = None
 
 
-def report(options: ReportOptions) -> None:
+def report(options: ReportOptions, console: Console) -> Answer:
     """Make report.html of a surface again.
 
     With --reference, the report compares the surface with it; the other options say how.
@@ -32,7 +34,6 @@ def report(options: ReportOptions) -> None:
         },
     )  # fmt: skip
     arguments = options.arguments()
-    from zlocus.core.progress import SilentProgress
     from zlocus.evaluation.comparison import Comparison
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import link_all
@@ -40,9 +41,9 @@ def report(options: ReportOptions) -> None:
 
     comparison = None if options.reference is None else Comparison(options.reference, **arguments)
     path = write_report(options.out, comparison)
-    link_all(options.out, SilentProgress())
+    link_all(options.out, console.progress)
     update_finished(options.out, (path.name, ITEM))
-    print(f"{path}: open it in a browser.")
+    return Answer(f"{path}: open it in a browser.", {"report": str(path)})
 
 
 def check_reference(reference: Path | None, options: dict[str, Any]) -> None:

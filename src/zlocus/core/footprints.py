@@ -32,6 +32,8 @@ BOX_POINTS, BOX_MARGIN = 8, 0.02
 # In a local frame the area to match is that of the tie points between these percentiles, extended on all sides by this
 # share of their extent, where there are at least this many tie points.
 AREA_PERCENT, AREA_MARGIN, MIN_TIES_FOR_AREA = (0.5, 99.5), 0.05, 20
+# Coordinates up to this may be degrees.
+LARGEST_DEGREES = 360.0
 
 
 def footprint(view: View, z: float, per_side: int = 8, margin_px: float = 0.0) -> FloatArray:
@@ -121,10 +123,12 @@ def check_overlap(scene: Scene, heights: float | Sequence[float]) -> None:
     at = f"at heights of {levels.min():g} to {levels.max():g} m" if len(levels) > 1 else f"at {levels[0]:g} m"
     if not overlap.any():
         where = "; ".join(f"{view.name} {_extent(hull.bounds)}" for view, hull in zip(scene.views, hulls, strict=True))
-        raise GeometryError(
-            f"No two images see the same ground {at} ({scene.crs.to_string()}): {where}. "
-            "Check that they show the same place and that each RPC belongs to its image."
+        advice = (
+            "Check that they show the same place and that each camera belongs to its image."
+            if scene.heights is None
+            else "Give --heights that contain the ground, or leave it out."
         )
+        raise GeometryError(f"No two images see the same ground {at} ({scene.crs.to_string()}): {where}. {advice}")
     for view, overlaps in zip(scene.views, overlap, strict=True):
         if not overlaps:
             warnings.warn(
@@ -230,9 +234,11 @@ def overlap_of(one: Bounds, other: Bounds) -> Bounds:
 
 def area_not_seen(bounds: Bounds, seen: Bounds, options: str) -> GeometryError:
     """The error of an area that two images see nothing of. seen : bounds of what they see; options : that gave it."""
+    looks_like_degrees = max(map(abs, bounds)) <= LARGEST_DEGREES < max(map(abs, seen))
+    hint = " Bounds are in metres of the result's CRS, and these look like degrees." if looks_like_degrees else ""
     return GeometryError(
-        f"The area asked for ({_extent(bounds)}) lies outside the ground that two images see ({_extent(seen)}). Check "
-        f"{options} and the CRS."
+        f"The area asked for ({_extent(bounds)}) lies outside the ground that two images see ({_extent(seen)}).{hint} "
+        f"Check {options} and the CRS."
     )
 
 

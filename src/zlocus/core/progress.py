@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, TextIO
 
@@ -62,6 +62,37 @@ class _SilentStage:
 
     def tell(self, text: str) -> None:
         pass
+
+
+@dataclass
+class ManifoldProgress:
+    """Shows the same in several ways, such as on a terminal and in a log."""
+
+    progresses: tuple[Progress, ...]
+
+    @contextmanager
+    def stage(self, name: str, total: float | None = None) -> Iterator[Stage]:
+        """See `Progress`."""
+        with ExitStack() as stack:
+            yield _ManifoldStage(tuple(stack.enter_context(each.stage(name, total)) for each in self.progresses))
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+        for each in self.progresses:
+            each.note(sentence)
+
+
+@dataclass
+class _ManifoldStage:
+    stages: tuple[Stage, ...]
+
+    def advance(self, n: float = 1) -> None:
+        for each in self.stages:
+            each.advance(n)
+
+    def tell(self, text: str) -> None:
+        for each in self.stages:
+            each.tell(text)
 
 
 @dataclass

@@ -58,12 +58,23 @@ def read_config(path: Path) -> RunConfig:
     ConfigError
         The file cannot be read; see also `config_from_dict`.
     """
+    return config_from_dict(values_of_file(path), str(path))
+
+
+def values_of_file(path: Path) -> Any:
+    """The values in a configuration file, as they stand there.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read.
+    """
     try:
         is_yaml = path.suffix.lower() in (".yaml", ".yml")
         values = read_yaml(path, MAX_CONFIG_BYTES) if is_yaml else _read_toml(path)
     except InputError as error:
         raise ConfigError(f"{error} `zlocus config -o FILE` writes a complete one.") from error
-    return config_from_dict({} if values is None else values, str(path))
+    return {} if values is None else values
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import rasterio
-from pyproj import CRS
+from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError, ProjError
 
 from zlocus.core.errors import ConfigError, InputError
@@ -21,6 +21,9 @@ LOCAL = (
 # Semi-major axis of the Earth, and the largest difference from it of ellipsoids and spheres in use.
 EARTH_MAJOR_M, MAX_MAJOR_DIFFERENCE_M = 6378137.0, 3e4
 MAX_CRS_NAME_CHARACTERS = 80
+# A metre of a CRS may differ from one on the ground by this share. National grids and UTM zones differ by less than
+# half of it, also in the neighbouring zone.
+MOST_SCALE_ERROR = 0.02
 
 
 def local_frame() -> CRS:
@@ -76,6 +79,33 @@ def utm_zone(lon: float, lat: float) -> CRS:
     """The WGS84 UTM zone of a place (degrees), without the exceptions for Norway and Svalbard."""
     zone = int((lon + 180.0) % 360.0 // 6.0) + 1
     return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+def check_fits(crs: CRS, lon: float, lat: float) -> None:
+    """Refuse a projected CRS whose metres are none at a place (degrees): it is made for another part of the Earth.
+
+    Raises
+    ------
+    ConfigError
+        Its scale differs from one by more than `MOST_SCALE_ERROR`.
+    """
+    factors = Proj(crs).get_factors(lon, lat)
+    scales = factors.meridional_scale, factors.parallel_scale
+    if all(abs(scale - 1.0) <= MOST_SCALE_ERROR for scale in scales):
+        return
+    area = crs.area_of_use
+    made_for = "" if area is None else f", which is made for {_degrees(area.bounds)}"
+    zone = utm_zone(lon, lat)
+    raise ConfigError(
+        f"The CRS {quoted(crs.to_string())} ({crs.name[:MAX_CRS_NAME_CHARACTERS]}){made_for}, has no metres where the "
+        f"images lie, {lon:.2f} degrees east, {lat:.2f} degrees north. Use {zone.to_string()}, or leave --crs out."
+    )
+
+
+def _degrees(bounds: tuple[float, float, float, float]) -> str:
+    """Bounds in degrees, in words."""
+    west, south, east, north = bounds
+    return f"{west:g} to {east:g} degrees east, {south:g} to {north:g} degrees north"
 
 
 def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import sys
 import time
@@ -27,6 +28,7 @@ from zlocus.io.safe_documents import read_json
 # Version of the keys of run.json and of the other JSON files of a result.
 SCHEMA = 2
 CHUNK_BYTES = 1 << 20
+LOGGER = logging.getLogger(__name__)
 LIBRARIES = (
     "zlocus",
     "numpy",
@@ -60,14 +62,14 @@ class Stopwatch:
         """Time a block as a stage. The block adds what its workers used to the record that it gets."""
         wall, cpu, workers = time.perf_counter(), time.process_time(), WorkerUsage()
         yield workers
-        self.stages.append(
-            {
-                "name": name,
-                "wall_s": round(time.perf_counter() - wall, 3),
-                "cpu_s": round(time.process_time() - cpu + workers.cpu_s, 3),
-                "peak_mb": round(max(peak_memory_mb(), workers.peak_mb), 1),
-            }
-        )
+        used = {
+            "name": name,
+            "wall_s": round(time.perf_counter() - wall, 3),
+            "cpu_s": round(time.process_time() - cpu + workers.cpu_s, 3),
+            "peak_mb": round(max(peak_memory_mb(), workers.peak_mb), 1),
+        }
+        self.stages.append(used)
+        LOGGER.debug("Stage %(name)s: %(wall_s)s s, CPU %(cpu_s)s s, largest memory so far %(peak_mb)s MB", used)
 
 
 def inputs_record(paths: Iterable[Path]) -> list[dict[str, str | None]]:

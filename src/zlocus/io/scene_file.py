@@ -35,7 +35,7 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
 from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera
-from zlocus.io.crs import checked_crs, local_frame, utm_zone
+from zlocus.io.crs import check_fits, checked_crs, local_frame, utm_zone
 from zlocus.io.images import (
     RasterImage,
     check_content,
@@ -162,7 +162,7 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[
     if len(opened) < 2:
         given = f"only {opened[0].entry.path} was given" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
-    frame = _default_crs(opened) if scene_input.crs is None else scene_input.crs
+    frame = _frame_of(opened, scene_input.crs)
     scene = scene_input.scene([each.view(frame) for each in opened], frame)
     scene = scene if chosen is None else chosen(scene)
     return replace(scene, views=tuple(map(_with_checked_image, scene.views)))
@@ -211,8 +211,8 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
     ]
     frame = scene_input.crs
     if frame is None:
-        opened = [each for each in opened if attempt(each.entry, partial(_default_crs, [each]))]
-        frame = _default_crs(opened) if opened else None
+        opened = [each for each in opened if attempt(each.entry, partial(_mean_centre, [each]))]
+        frame = _frame_of(opened, None) if opened else None
     views = [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(each.view, frame))]
     scene = scene_input.scene(views, frame) if views and frame is not None else None
     refused = [refused_by_name[entry.name] for entry in scene_input.entries if entry.name in refused_by_name]
@@ -307,6 +307,13 @@ class _OpenedView:
     entry: _ResolvedEntry
     image: RasterImage
     camera: OpenedCamera
+
+    @property
+    def centre(self) -> tuple[float, float] | None:
+        """Longitude and latitude of the centre, see `OpenedCamera`."""
+        top, left, rows, cols = held_window(self.image)
+        # The centre of an image whose middle is that of the stored part.
+        return self.camera.centre((2 * top + rows, 2 * left + cols))
 
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
@@ -429,13 +436,20 @@ def _frame_crs(frame: Frame, path: Path) -> CRS:
         raise ConfigError(f"{path}: frame.crs: {error}") from error
 
 
-def _default_crs(opened: Sequence[_OpenedView]) -> CRS:
-    """The UTM zone of the mean of the images' centres. Longitudes on both sides of the date line are close together."""
+def _frame_of(opened: Sequence[_OpenedView], crs: CRS | None) -> CRS:
+    """The CRS that is given, where it fits the place of the images; without one the UTM zone of their mean centre."""
+    if crs is None:
+        return utm_zone(*_mean_centre(opened))
+    if all(each.centre is not None for each in opened):
+        check_fits(crs, *_mean_centre(opened))
+    return crs
+
+
+def _mean_centre(opened: Sequence[_OpenedView]) -> tuple[float, float]:
+    """Mean longitude and latitude of the images' centres, degrees. The date line is no gap between longitudes."""
     centres = []
     for each in opened:
-        top, left, rows, cols = held_window(each.image)
-        # The centre of an image whose middle is that of the stored part.
-        centre = each.camera.centre((2 * top + rows, 2 * left + cols))
+        centre = each.centre
         if centre is None:
             raise InputError(
                 f"The camera of {each.image.path} does not place its centre on the Earth. Check it, or give --crs."
@@ -443,7 +457,7 @@ def _default_crs(opened: Sequence[_OpenedView]) -> CRS:
         centres.append(centre)
     first = centres[0][0]
     lon = first + sum((lon - first + 180.0) % 360.0 - 180.0 for lon, _ in centres) / len(centres)
-    return utm_zone(lon, sum(lat for _, lat in centres) / len(centres))
+    return lon, sum(lat for _, lat in centres) / len(centres)
 
 
 def _check_distinct(paths: Sequence[Path]) -> None:

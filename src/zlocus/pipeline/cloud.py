@@ -130,28 +130,40 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     watch = Stopwatch()
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_cloud_run(request, config, progress)
-        references = reference_names(run.opened_inputs.scene, request.references)
+        reference_names(run.opened_inputs.scene, request.references)  # refuses names that are none
     finished = _already_finished(request, run, progress)
     if finished is not None:
         return finished
+    is_compiled, is_whole = CACHE.is_complete, not run.checkpoint.finished
+    prepared_cloud = oriented_cloud(request, config, run, watch, progress)
+    progress.note(str(prepared_cloud.plan))
     scene = run.opened_inputs.scene
+    result = _made(request, run, prepared_cloud, watch, progress)
+    if is_whole:
+        remember_run(prepared_cloud.plan, request, scene.views, timed_stages(watch.stages, is_compiled))
+    return _accepted(request, result)
+
+
+def oriented_cloud(
+    request: CloudRequest, config: RunConfig, run: OpenRun, stopwatch: Stopwatch, progress: Progress
+) -> PreparedCloud:
+    """Orient the images of a run and prepare the cloud: the stages between opening and matching.
+
+    Errors as `prepare_cloud`, and those of the orientation.
+    """
+    scene = run.opened_inputs.scene
+    references = reference_names(scene, request.references)
     if request.bounds is None and request.area is None:
         # All pixels are matched: what has no room is refused before tie points are measured.
         check_room_for_cloud(request.out, n_pixels_of(scene, references), len(references))
     config = depth_options(config) if is_by_depth(scene) else config
     progress.note(said_before_orientation(scene.views, None))
-    is_compiled, is_whole = CACHE.is_complete, not run.checkpoint.finished
-    with watch.stage("orient"), kernels_compiling(progress):
+    with stopwatch.stage("orient"), kernels_compiling(progress):
         setup = set_up_images(scene, config, progress, known_ties(run.checkpoint, scene, progress))
         note_orientation(setup.orientation, progress)
         references = supported_references(references, setup)
-    with watch.stage("setup"):
-        prepared_cloud = prepare_cloud(request, config, run, setup, references)
-        progress.note(str(prepared_cloud.plan))
-    result = _made(request, run, prepared_cloud, watch, progress)
-    if is_whole:
-        remember_run(prepared_cloud.plan, request, scene.views, timed_stages(watch.stages, is_compiled))
-    return _accepted(request, result)
+    with stopwatch.stage("setup"):
+        return prepare_cloud(request, config, run, setup, references)
 
 
 def _made(

@@ -34,6 +34,7 @@ from zlocus.products.tie_layers import write_ties
 TERRAIN_PX = 16.0
 # Tie points that an orientation needs at least, all images together.
 MIN_TIES = 4
+ORIENTATION = "orientation.json"
 
 
 def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) -> str:
@@ -69,7 +70,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         record: dict[str, Any] = orientation_record(orientation, scene)
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
-        write_record(request.out / "orientation.json", record)
+        write_record(request.out / ORIENTATION, record)
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     if not request.cameras:
         return f"{request.out / 'ties.gpkg'}: {len(orientation.xyz)} tie points."

@@ -25,6 +25,8 @@ from zlocus.pipeline.rank_advice import SharedPoints, advice
 from zlocus.pipeline.setup import RunSetup, open_inputs, orient_views, set_up_run
 from zlocus.products.tie_layers import counted_pairs, label_counts, write_ranking, write_ties
 
+RANKING_TABLE = "ranking.json"
+
 
 def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str:
     """Label every pair of images at the tie points, as `zlocus dsm` does to choose images.
@@ -56,7 +58,7 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         write_ties(request.out / "ties.gpkg", orientation, setup.scene)
         write_ranking(request.out / "ranking.gpkg", labelled_ties, names, setup.scene.crs)
         counts = label_counts(labelled_ties, len(names))
-        write_record(request.out / "ranking.json", ranking_record(counts, names))
+        write_record(request.out / RANKING_TABLE, ranking_record(counts, names))
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     views = setup.match_scene.views
     rates = np.array([parallax_rate(view, setup.match_scene.ground_height) for view in views])

@@ -24,7 +24,7 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from zlocus.core.errors import ConfigError, CoverageError, GeometryError
+from zlocus.core.errors import ConfigError, CoverageError, GeometryError, ZlocusError
 from zlocus.core.footprints import (
     Bounds,
     area_not_seen,
@@ -37,7 +37,7 @@ from zlocus.core.footprints import (
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
-from zlocus.core.progress import Progress
+from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.request_checks import is_scene_file
 from zlocus.core.requests import SetupRequest
 from zlocus.core.resources import cores
@@ -57,6 +57,7 @@ from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
+from zlocus.pipeline.request_fit import check_bounds_in_metres, check_heights_of_cameras
 
 # A height takes at least this many images.
 MIN_VIEWS = 2
@@ -117,7 +118,9 @@ def open_inputs(request: SetupRequest, progress: Progress, overlap_check: Overla
     def chosen(scene: Scene) -> Scene:
         if is_local(scene.crs):
             _refuse_maps_in_local_frame(request)
+        check_bounds_in_metres(request.bounds, scene)
         scene = sorted_views(with_heights(scene, request.heights, datum, bounds))
+        check_heights_of_cameras(scene.heights, scene)
         return views_of_area(scene, bounds or scene.bounds, (request.reference, *request.references), progress)
 
     scene = open_scene(request.inputs, requested_crs(request.crs) if like is None else _crs_of(like), chosen)
@@ -234,7 +237,10 @@ def set_up_run(
         Heights, area or resolution that cannot be used.
     """
     corrected = orientation.apply(opened_inputs.scene)
-    scene = supported_views(corrected, orientation)
+    try:
+        scene = supported_views(corrected, orientation)
+    except CoverageError as error:
+        raise _wrong_heights(request, opened_inputs.scene, config) or error from error
     height_range = height_range_of_run(request, scene, orientation, config, progress)
     grid = grid_of_run(request, opened_inputs.like, scene, orientation, height_range)
     match_scene = match_scene_of_run(request, scene, orientation, height_range, grid, config)
@@ -267,6 +273,25 @@ def supported_views(scene: Scene, orientation: Orientation) -> Scene:
         f"No two images are held together by tie points (looked at: {some_names([v.name for v in scene.views])}), so "
         "nothing was matched. Check that they show the same ground and that each camera belongs to its image; where "
         "cameras may be far off, set a larger orientation.max_pointing_px in --config."
+    )
+
+
+def _wrong_heights(request: SetupRequest, scene: Scene, config: RunConfig) -> GeometryError | None:
+    """The error of requested heights that do not contain the ground, where tie points are found without them."""
+    if request.heights is None:
+        return None
+    try:
+        orientation = orient_views(replace(scene, heights=None), config.orientation, SilentProgress())
+    except ZlocusError:
+        return None
+    z = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m), 2]
+    if len(z) < MIN_TIES_TO_COMPARE:
+        return None
+    low, high = np.percentile(z, (1, 99))
+    return GeometryError(
+        f"No tie point has one of the heights asked for, {request.heights[0]:.6g} to {request.heights[1]:.6g} m: those "
+        f"of these images lie between {low:.0f} and {high:.0f} m above the ellipsoid. Give --heights that contain the "
+        "ground, or leave it out."
     )
 
 

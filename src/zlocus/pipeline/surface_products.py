@@ -126,9 +126,9 @@ def run_record(
     return {
         **_request_record(request, config, setup.scene, inputs),
         "orientation": setup.orientation.as_dict(),
-        "grid": _grid_record(setup.grid, setup.scene.crs),
+        "grid": grid_record(setup.grid, setup.scene.crs),
         "vertical": vertical_datum.as_dict(),
-        "heights": _heights_record(setup),
+        "heights": heights_record(setup),
         **tally.as_dict(),
         "plan": plan.as_dict(),
     }
@@ -148,13 +148,13 @@ def _request_record(
     }
 
 
-def _grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
+def grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
     """The products' grid."""
     geobox = grid.geobox
     return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
 
 
-def _heights_record(setup: RunSetup) -> dict[str, Any]:
+def heights_record(setup: RunSetup) -> dict[str, Any]:
     """The heights at which the surface was expected and those searched, and the reference image of the scene."""
     return {
         "range_m": [round(z, 3) for z in setup.height_range.expected],

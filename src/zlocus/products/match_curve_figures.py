@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = 3
+POINT = "point.json"
 DPI = 110
 # The colours of Okabe and Ito, which colour-blind readers can distinguish. The mean is black.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8B5A2B", "#7A5195")
@@ -58,7 +59,7 @@ def write_point(folder: Path, report: PointReport, loci: Sequence[Locus], option
     for name, figure in figures.items():
         write_atomically(folder / name, partial(figure.savefig, format="png", dpi=DPI))
     write_atomically(folder / "curves.csv", lambda part: write_csv(part, report))
-    write_record(folder / "point.json", point_record(report, options))
+    write_record(folder / POINT, point_record(report, options))
 
 
 def match_curves_figure(report: PointReport, title: str = "Correlation with each search image") -> Figure:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 NAME = "events.jsonl"
+LOGGER = logging.getLogger(__name__)
 
 
 class EventLog:
@@ -25,5 +27,6 @@ class EventLog:
     def add(self, event: str, **more: Any) -> None:
         """Add an event with the time and some details."""
         record = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **more}
+        LOGGER.debug("Event %s: %s", event, ", ".join(f"{name} {value}" for name, value in more.items()))
         with suppress(OSError), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")

@@ -1,0 +1,67 @@
+"""The help of a command: its options in groups, and examples."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from itertools import groupby
+from typing import Any
+
+from typer.core import TyperCommand
+
+from zlocus.cli.console import GROUP
+
+# Options without a group of their own, in commands that have few of them.
+OTHER = "Options"
+EXAMPLES = {
+    "dsm": """
+        zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --dry-run
+        zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --resolution 0.5
+        zlocus dsm scene.yaml -o surface --dem dem.tif --products hillshade,dtm
+        """,
+    "cloud": """
+        zlocus cloud scene.yaml -o cloud --reference img_2 --fill interpolate
+        """,
+    "orient": """
+        zlocus orient scene.yaml -o oriented --control points.csv
+        """,
+}
+
+
+class GroupedHelp(TyperCommand):
+    """A command whose help shows the options in groups, each under the heading that the options name."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, and the options group by group, in the order in which groups first appear."""
+        shown = [param for param in self.get_params(ctx) if param.get_help_record(ctx) is not None]
+        headings = list(dict.fromkeys(_heading(param) for param in shown))
+        shown.sort(key=lambda param: headings.index(_heading(param)))
+        for heading, params in groupby(shown, _heading):
+            with formatter.section(heading):
+                formatter.write_dl([_record(param, ctx) for param in params])
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the examples, a line each."""
+        if self.epilog:
+            with formatter.section("Examples"):
+                for line in inspect.cleandoc(self.epilog).splitlines():
+                    formatter.write(f"{' ' * formatter.current_indent}{line}\n")
+
+
+def _heading(param: Any) -> str:
+    """The heading of the group that a parameter belongs to."""
+    if param.param_type_name == "argument":
+        return "Arguments"
+    return GROUP if param.name == "help" else getattr(param, "rich_help_panel", None) or OTHER
+
+
+def _record(param: Any, ctx: Any) -> tuple[str, str]:
+    """Name and meaning of a parameter; that of an argument without its type in Python."""
+    name, meaning = param.get_help_record(ctx)
+    return (name.partition(" <")[0] if param.param_type_name == "argument" else name), meaning
+
+
+def short_help(run: Callable[..., Any]) -> str:
+    """The first paragraph of a command's help, which stands in the list of all commands."""
+    paragraph, *_ = inspect.cleandoc(run.__doc__ or "").split("\n\n")
+    return " ".join(paragraph.split())

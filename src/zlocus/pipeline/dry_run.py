@@ -1,0 +1,110 @@
+"""The plans of `--dry-run`: what a command would do, without a file written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import Progress, duration
+from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupRequest
+from zlocus.io.run_record import Stopwatch
+from zlocus.pipeline.cloud import oriented_cloud
+from zlocus.pipeline.dsm import check_before_opening, prepare_surface
+from zlocus.pipeline.open_run import OpenRun, open_cloud_run, open_run
+from zlocus.pipeline.orient import control_points, options_of_command, terrain_heights
+from zlocus.pipeline.run_plan import Plan, orientation_s
+from zlocus.pipeline.setup import open_inputs
+from zlocus.pipeline.surface_products import grid_record, heights_record
+from zlocus.products.corrected_cameras import check_cameras_can_be_written
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """What a command would do. text : in sentences; values : the same for programs."""
+
+    text: str
+    values: Mapping[str, Any]
+
+
+def plan_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DryRun:
+    """The plan of `zlocus dsm`: images, grid, heights, tiles, memory and time.
+
+    Errors as `run_dsm` before its first tile.
+    """
+    check_before_opening(request, config)
+    with progress.stage("Opening images"):
+        run = open_run(request, config, progress)
+    surface = prepare_surface(request, config, run, Stopwatch(), progress)
+    setup, scene = surface.setup, surface.setup.match_scene
+    (rows, cols), names = setup.grid.geobox.shape.yx, [view.name for view in scene.views]
+    grid, heights = grid_record(setup.grid, setup.scene.crs), heights_record(setup)
+    low, high = heights["searched_m"]
+    lines = [
+        f"Surface: {rows} x {cols} cells of {scene.cell_size:g} m in {setup.scene.crs.name}, from {len(names)} of "
+        f"{len(setup.scene.views)} images.",
+        f"Heights: {low:.1f} to {high:.1f} m above the ellipsoid, in steps of {scene.height_step:.3g} m.",
+        *_end_of(surface.plan, run),
+    ]
+    values = {"grid": grid, "heights": heights, "images": names, **_plan_values(surface.plan, run)}
+    return DryRun("\n".join(lines), values)
+
+
+def plan_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> DryRun:
+    """The plan of `zlocus cloud`: reference images, tiles, memory and time.
+
+    Errors as `run_cloud` before its first tile.
+    """
+    with progress.stage("Opening images"):
+        run = open_cloud_run(request, config, progress)
+    cloud = oriented_cloud(request, config, run, Stopwatch(), progress)
+    named = ", ".join(cloud.references)
+    lines = [f"Cloud: the pixels of {len(cloud.references)} images ({named}).", *_end_of(cloud.plan, run)]
+    return DryRun("\n".join(lines), {"images": cloud.references, **_plan_values(cloud.plan, run)})
+
+
+def plan_orient(request: OrientRequest, config: RunConfig, progress: Progress) -> DryRun:
+    """The plan of `zlocus orient` and `zlocus ties`: images, time for tie points, and the corrections.
+
+    Errors as `run_orient` before tie points are found.
+    """
+    with progress.stage("Opening images"):
+        opened_inputs = open_inputs(SetupRequest.of(request), progress, "unless local")
+        scene = opened_inputs.scene
+        if request.cameras:
+            check_cameras_can_be_written(request.inputs)
+        control = None if request.control is None else control_points(request, scene)
+        if request.dem is not None:
+            terrain_heights(request.dem, scene, request.dem_vertical)
+    options, seconds = options_of_command(config.orientation, request.cameras), orientation_s(scene.views, None)
+    n_pixels, n_control = (
+        sum(math.prod(view.image.shape) for view in scene.views),
+        0 if control is None else len(control.names),
+    )
+    what = f"cameras corrected by the model {options.model}" if request.cameras else "no camera corrected"
+    text = (
+        f"Orientation: {len(scene.views)} images of {n_pixels / 1e6:.3g} Mpx together, {n_control} control and check "
+        f"points, {what}.\nTie points take about {duration(seconds)} at the typical rate.\nNothing was written."
+    )
+    names = [view.name for view in scene.views]
+    return DryRun(
+        text, {"images": names, "model": options.model, "control_points": n_control, "ties_s": round(seconds, 1)}
+    )
+
+
+def _end_of(plan: Plan, run: OpenRun) -> list[str]:
+    """The last lines of a plan. run : with what an earlier run left in the folder."""
+    lines = [str(plan)]
+    if run.finished is not None:
+        lines.append("The folder holds this very result already: the command would make what is missing only.")
+    elif run.checkpoint.finished:
+        lines.append(f"The folder holds {len(run.checkpoint.finished)} finished tiles of this run, which are kept.")
+    return [*lines, "Nothing was written."]
+
+
+def _plan_values(plan: Plan, run: OpenRun) -> dict[str, Any]:
+    """The plan for programs."""
+    there = {"is_finished": run.finished is not None, "finished_tiles": len(run.checkpoint.finished)}
+    return {"plan": plan.as_dict() | there}
