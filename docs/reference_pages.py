@@ -16,20 +16,33 @@ from zlocus.core.options import RunConfig
 OF_ALL = re.compile(r"(?<=\.) (?=(?:Returns|Source:|Heights come back) )")
 
 
+def all_commands() -> dict[str, Any]:
+    """The commands of `zlocus` by their names, in the order of their definition; those of a group as `tiles plan`."""
+    # Typer ships its own copy of Click, whose classes are private: hence `Any`.
+    commands: dict[str, Any] = {}
+    for name, command in vars(typer.main.get_command(app))["commands"].items():
+        of_group = vars(command).get("commands", {})
+        commands |= {f"{name} {each}": of_group[each] for each in of_group} or {name: command}
+    return commands
+
+
 def command_reference() -> str:
     """Section for each command of `zlocus`: its purpose, arguments and options, in the order of their definition."""
-    # Typer ships its own copy of Click, whose classes are private: hence `Any`.
-    commands: dict[str, Any] = vars(typer.main.get_command(app))["commands"]
-    return "\n\n".join(_command(name, command) for name, command in commands.items())
+    return "\n\n".join(_command(name, command) for name, command in all_commands().items())
 
 
 def _command(name: str, command: Any) -> str:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     required = [f"{_names(p)} {_metavar(p)}" for p in command.params if p.required and p not in arguments]
-    shown = [f"{p.metavar}{'...' if p.nargs < 0 else ''}" for p in arguments]
+    shown = [_shown(p) for p in arguments]
     usage = " ".join(["zlocus", name, *shown, *(each.replace("-o, --out", "-o") for each in required), "[OPTIONS]"])
     lines = [f"## zlocus {name}", "", " ".join(command.help.split()), "", f"`{usage}`", "", "| | meaning | default |"]
     return "\n".join([*lines, "|---|---|---|", *map(_parameter, command.params)])
+
+
+def _shown(argument: Any) -> str:
+    words = f"{argument.metavar}{'...' if argument.nargs < 0 else ''}"
+    return words if argument.required else f"[{words}]"
 
 
 def _parameter(parameter: Any) -> str:

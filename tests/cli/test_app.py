@@ -77,7 +77,22 @@ def test_version(zl):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["demo"], ["dsm"], ["cloud"], ["curves"], ["paper"], ["doctor"], ["evaluate"], ["config"]]
+    "command",
+    [
+        [],
+        ["demo"],
+        ["dsm"],
+        ["cloud"],
+        ["curves"],
+        ["paper"],
+        ["doctor"],
+        ["evaluate"],
+        ["config"],
+        ["tiles"],
+        ["tiles", "plan"],
+        ["tiles", "run"],
+        ["tiles", "assemble"],
+    ],
 )
 def test_every_command_has_help(zl, command):
     result = zl(*command, "--help")

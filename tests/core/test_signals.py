@@ -211,7 +211,12 @@ send(signal.SIGTERM)
 
 def test_every_command_ends_this_way():
     wrapped = command_of("config", ConfigOptions, config).__code__
-    commands = {one.name or one.callback.__name__: one.callback.__code__ is wrapped for one in app.registered_commands}
+    apps = [app, *(group.typer_instance for group in app.registered_groups)]
+    commands = {
+        one.name or one.callback.__name__: one.callback.__code__ is wrapped
+        for each in apps
+        for one in each.registered_commands
+    }
     assert len(commands) > 10
     assert all(commands.values()), commands
 

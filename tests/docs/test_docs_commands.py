@@ -29,6 +29,8 @@ from docs_commands import (
     PAGES_WITH_COMMANDS,
     PROJ_GRIDS,
     Step,
+    all_commands,
+    command_name,
     inline_commands,
     name_of,
     steps_of,
@@ -38,7 +40,7 @@ from zlocus.cli.app import app
 from zlocus.cli.console import OutputOptions
 from zlocus.synthetic.__main__ import _parser
 
-COMMANDS = vars(typer.main.get_command(app))["commands"]
+COMMANDS = all_commands()
 # Per cent, of the figures in the tutorial.
 TOLD_TO = 0.5
 ENDS_WITHIN_S = 10.0
@@ -52,7 +54,7 @@ def options_of(text: str) -> set[str]:
 
 def check_zlocus(text: str) -> None:
     """The command and the options of a line of `zlocus` exist."""
-    name = text.split()[1]
+    name = command_name(text.split())
     assert name in COMMANDS or name.startswith("--"), text
     command = COMMANDS[name] if name in COMMANDS else typer.main.get_command(app)
     known = {option for parameter in command.params for option in parameter.opts} | {"--help"}
@@ -285,7 +287,7 @@ def test_usage_lines_name_all_options(page):
     """A line that shows options in brackets shows all that there are."""
     for step in steps_of(page):
         if step.text.startswith("zlocus ") and "[--" in step.text:
-            command = COMMANDS[step.text.split()[1]]
+            command = COMMANDS[command_name(step.text.split())]
             of_all = {field.name for field in fields(OutputOptions)}  # the page on scripts tells them once
             known = {p.opts[0] for p in command.params if p.param_type_name == "option" and p.name not in of_all}
             assert options_of(step.text) >= known - {"--overwrite"}, step.text

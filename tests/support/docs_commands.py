@@ -7,9 +7,11 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
+import typer.main
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +20,7 @@ from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
 from places import ROOT
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
+from zlocus.cli.app import app
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import KNOWN_GEOIDS
 from zlocus.sensors.frame import FrameModel
@@ -62,6 +65,21 @@ def steps_of(page: Path) -> list[Step]:
         if language in ("", None) and lines and lines[0].split()[0] in PROGRAMS:
             found += map(Step, lines)
     return found
+
+
+def all_commands() -> dict[str, Any]:
+    """The commands of the command line by their names; those of a group as `group command`, beside the group."""
+    commands: dict[str, Any] = {}
+    for name, command in vars(typer.main.get_command(app))["commands"].items():
+        of_group = vars(command).get("commands", {})
+        commands |= {name: command} | {f"{name} {each}": of_group[each] for each in of_group}
+    return commands
+
+
+def command_name(words: list[str]) -> str:
+    """The name of the command in words that begin with `zlocus`."""
+    pair = " ".join(words[1:3])
+    return pair if pair in all_commands() else words[1]
 
 
 def inline_commands(page: Path) -> list[str]:
@@ -223,6 +241,7 @@ def lay_out_surface(folder: Path) -> None:
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
     "README.md": lay_out_readme,
+    "docs/how-to/array_jobs.md": lay_out_images,
     "docs/how-to/cloud.md": lay_out_images_and_area,
     "docs/how-to/curves.md": lay_out_images,
     "docs/how-to/doctor.md": lay_out_images,

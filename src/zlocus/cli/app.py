@@ -31,6 +31,7 @@ from zlocus.cli.paper import PaperOptions, paper
 from zlocus.cli.products import ProductsOptions, products
 from zlocus.cli.rank import RankOptions, rank
 from zlocus.cli.report import ReportOptions, report
+from zlocus.cli.tiles import tiles
 from zlocus.core.signals import handle_signals
 from zlocus.core.startup import prepare
 
@@ -65,6 +66,7 @@ for name, options, run in COMMANDS:
     app.command(name, cls=GroupedHelp, epilog=EXAMPLES.get(name), short_help=short_help(run))(
         command_of(name, options, run)
     )
+app.add_typer(tiles)
 
 
 def _print_version(wanted: bool) -> None:
@@ -82,6 +84,12 @@ def _options(
     """Options before the command."""
 
 
+def command_name(words: Sequence[str]) -> str:
+    """The name of the command that words call, with that of its group."""
+    n = 2 if words[:1] == [tiles.info.name] else 1
+    return " ".join(word for word in words[:n] if not word.startswith("-"))
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit, in a process of its own; `arguments` default to those of the process."""
     handle_signals()
@@ -97,6 +105,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         usage.show()
         if "--json" in words:
-            Console(words[0], OutputOptions(as_json=True)).failed(usage.format_message(), usage.exit_code)
+            Console(command_name(words), OutputOptions(as_json=True)).failed(usage.format_message(), usage.exit_code)
         status = usage.exit_code
     sys.exit(status or 0)

@@ -145,9 +145,9 @@ def method_of(options: DsmOptions) -> str:
     return options.method or METHODS_OF_SELECTION.get(options.selection, METHODS)[0]
 
 
-def dsm(options: DsmOptions, console: Console) -> Answer:
-    """Make a digital surface model from images."""
-    request = DsmRequest(
+def dsm_request(options: DsmOptions) -> DsmRequest:
+    """The surface that the options ask for."""
+    return DsmRequest(
         inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
         bounds=options.bounds, like=options.like, area=options.area, mask=options.mask, heights=options.heights,
         dem=options.dem, dem_vertical=options.dem_vertical, reference=options.reference, views=options.views,
@@ -156,6 +156,11 @@ def dsm(options: DsmOptions, console: Console) -> Answer:
         workers=options.workers, scheduler=options.scheduler, memory_gb=options.memory, overwrite=options.overwrite,
         resume=options.resume, products=product_names(options.maps), report=options.report,
     )  # fmt: skip
+
+
+def dsm(options: DsmOptions, console: Console) -> Answer:
+    """Make a digital surface model from images."""
+    request = dsm_request(options)
     check_output(request.out, request.overwrite, may_be_same=True)
     config = config_of(options.config, options.settings)
     if options.dry_run:

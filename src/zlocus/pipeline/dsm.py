@@ -13,6 +13,9 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from zlocus.core.errors import CoverageError, OutputError, StoppedError
 from zlocus.core.footprints import matched_area
@@ -21,11 +24,15 @@ from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DsmRequest, SetupRequest, check_output
 from zlocus.core.resources import cores
+from zlocus.io.input_files import InputFiles
 from zlocus.io.rasters import compression_threads
 from zlocus.io.run_record import Stopwatch, read_record
+from zlocus.io.vertical import VerticalDatum
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most, plan_tiles
 from zlocus.pipeline.execution.precompile import kernels_compiling
+from zlocus.pipeline.execution.tasks import Outcome
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
@@ -46,7 +53,7 @@ from zlocus.pipeline.surface_products import (
     write_report_inputs,
 )
 from zlocus.pipeline.tile_makers import tile_maker
-from zlocus.pipeline.tile_run import Tally, TileRun, tile_job, workers_for
+from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD
 
@@ -99,9 +106,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
 def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile_runs: list[TileRun]) -> DsmResult:
     """See `run_dsm`. tile_runs : takes the run of the tiles once it starts, for messages after an interrupt."""
     watch = Stopwatch()
-    check_derived(request.products, config.products, may_have_terrain(request))
-    if request.report:
-        importlib.import_module("zlocus.pipeline.report_inputs")  # a fault there must show now, not after the matching
+    check_before_opening(request, config)
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_run(request, config, progress)
     if run.finished is not None:
@@ -109,53 +114,140 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
         if not missing.matched:
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)
-    opened_inputs, inputs, checkpoint, out, tally = run.opened_inputs, run.inputs, run.checkpoint, request.out, Tally()
-    progress.note(said_before_orientation(opened_inputs.scene.views, request.workers))
+    checkpoint, out, tally = run.checkpoint, request.out, Tally()
     is_compiled, is_whole = CACHE.is_complete, not checkpoint.finished
-    with watch.stage("orient"), kernels_compiling(progress):
-        ties = known_ties(checkpoint, opened_inputs.scene, progress)
+    prepared = prepare_surface(request, config, run, watch, progress)
+    progress.note(str(prepared.plan))
+    tile_run = TileRun(prepared.tile_job, prepared.tiles, checkpoint, EventLog(out))
+    with made_folder(out), checkpoint.open(prepared.digest, prepared.before):
+        tile_runs.append(tile_run)
+        with watch.stage("match") as elsewhere:
+            plan, setup = prepared.plan, prepared.setup
+            make = tile_maker(request, prepared.tile_job, checkpoint, setup, plan, tally, progress)
+            failed = tile_run.run(plan, workers_for(plan, make, progress), progress, elsewhere)
+        run.inputs.check(len(checkpoint.finished), may_miss=bool(failed))
+        tile_run.check(failed, request.partial)
+        with watch.stage("record"):
+            checksums = run.inputs.record(len(checkpoint.finished))
+        with watch.stage("write"):
+            write_rasters(prepared, tile_run, failed, tally, progress)
+    if is_whole:
+        views = run.opened_inputs.scene.views
+        remember_run(prepared.plan, request, views, timed_stages(watch.stages, is_compiled))
+    record = write_products(prepared, tally, checksums, watch, progress)
+    write_maps(request, config, watch, record, progress)
+    tile_run.end(failed, tally)
+    return finish(prepared, checkpoint, tally, progress)
+
+
+@dataclass(frozen=True)
+class PreparedSurface:
+    """A surface whose tiles can be matched: everything that they and the products need.
+
+    inputs : files, with their states when the run began; tile_job : makes the tiles; digest : SHA-256 of the run setup.
+    """
+
+    request: DsmRequest
+    config: RunConfig
+    vertical_datum: VerticalDatum
+    inputs: InputFiles
+    setup: RunSetup
+    tiles: Sequence[Tile]
+    plan: Plan
+    tile_job: TileJob
+    digest: str
+
+    @property
+    def before(self) -> dict[str, NDArray[Any]]:
+        """The tie points as arrays, which a checkpoint keeps before its first tile; none where they are not refined."""
+        ties = self.setup.orientation.refined_ties
+        return {} if ties is None else ties.arrays()
+
+
+def check_before_opening(request: DsmRequest, config: RunConfig) -> None:
+    """Refuse, before images are opened, maps and a report that could not be made after the matching."""
+    check_derived(request.products, config.products, may_have_terrain(request))
+    if request.report:
+        importlib.import_module("zlocus.pipeline.report_inputs")  # a fault there must show now, not after the matching
+
+
+def prepare_surface(
+    request: DsmRequest, config: RunConfig, run: OpenRun, stopwatch: Stopwatch, progress: Progress
+) -> PreparedSurface:
+    """Orient the views of a run and set it up: the stages between opening and matching."""
+    opened_inputs = run.opened_inputs
+    progress.note(said_before_orientation(opened_inputs.scene.views, request.workers))
+    with stopwatch.stage("orient"), kernels_compiling(progress):
+        ties = known_ties(run.checkpoint, opened_inputs.scene, progress)
         orientation = orient_views(
             opened_inputs.scene, config.orientation, progress, threads=request.workers, known_ties=ties
         )  # fmt: skip
         note_orientation(orientation, progress)
-    with watch.stage("setup"):
+    with stopwatch.stage("setup"):
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
-        progress.note(str(plan))
     job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
-    tile_run = TileRun(job, tiles, checkpoint, EventLog(out))
-    with (
-        made_folder(out),
-        checkpoint.open(digest, {} if orientation.refined_ties is None else orientation.refined_ties.arrays()),
-    ):
-        tile_runs.append(tile_run)
-        with watch.stage("match") as elsewhere:
-            make = tile_maker(request, job, checkpoint, setup, plan, tally, progress)
-            failed = tile_run.run(plan, workers_for(plan, make, progress), progress, elsewhere)
-        inputs.check(len(checkpoint.finished), may_miss=bool(failed))
-        tile_run.check(failed, request.partial)
-        with watch.stage("record"):
-            checksums = inputs.record(len(checkpoint.finished))
-        with watch.stage("write"):
-            remove_earlier_products(out)
-            with surface_rasters(request, setup, opened_inputs.vertical_datum) as rasters:
-                tile_run.assemble(failed, rasters, tally, progress)
-                inputs.check(len(checkpoint.finished))  # a terrain model that fills gaps is read again here
-    if is_whole:
-        remember_run(plan, request, opened_inputs.scene.views, timed_stages(watch.stages, is_compiled))
-    with watch.stage("points"):
-        write_points(out, setup, tally.labelled_ties, opened_inputs.vertical_datum)
+    return PreparedSurface(
+        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest
+    )  # fmt: skip
+
+
+def write_rasters(
+    prepared_surface: PreparedSurface,
+    tile_run: TileRun,
+    failed_outcomes: Sequence[Outcome],
+    tally: Tally,
+    progress: Progress,
+) -> None:
+    """Write the rasters in place of an earlier run's products. failed_outcomes : of the tiles that stay empty.
+
+    Raises
+    ------
+    StoppedError
+        A terrain model that fills gaps has changed, or a tile is damaged; no raster is written.
+    """
+    remove_earlier_products(prepared_surface.request.out)
+    with surface_rasters(prepared_surface.request, prepared_surface.setup, prepared_surface.vertical_datum) as rasters:
+        tile_run.assemble(failed_outcomes, rasters, tally, progress)
+        # A terrain model that fills gaps was read again.
+        prepared_surface.inputs.check(len(tile_run.checkpoint.finished))
+
+
+def write_products(
+    prepared_surface: PreparedSurface,
+    tally: Tally,
+    checksums: list[dict[str, Any]],
+    stopwatch: Stopwatch,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write points and what the report shows, and return the content of run.json. checksums : of the inputs."""
+    request, config, setup = prepared_surface.request, prepared_surface.config, prepared_surface.setup
+    datum = prepared_surface.vertical_datum
+    with stopwatch.stage("points"):
+        write_points(request.out, setup, tally.labelled_ties, datum)
     if request.report:
-        write_report_inputs(out, setup, opened_inputs.vertical_datum, config, watch, progress)
-        remove_outdated_curves(out, inputs, progress)
-    record = run_record(request, config, setup, opened_inputs.vertical_datum, checksums, tally, plan)
-    write_maps(request, config, watch, record | {"setup_sha256": digest, "stages": watch.stages}, progress)
-    tile_run.end(failed, tally)
-    shortcoming = shortcoming_of(tally, setup.doubts, out, progress)
-    write_finished(out, checkpoint.key, shortcoming)
+        write_report_inputs(request.out, setup, datum, config, stopwatch, progress)
+        remove_outdated_curves(request.out, prepared_surface.inputs, progress)
+    record = run_record(request, config, setup, datum, checksums, tally, prepared_surface.plan)
+    return record | {"setup_sha256": prepared_surface.digest, "stages": stopwatch.stages}
+
+
+def finish(
+    prepared_surface: PreparedSurface, checkpoint: TileCheckpoint, tally: Tally, progress: Progress
+) -> DsmResult:
+    """Record that the run is finished, with the checksums of its products, and remove its tiles.
+
+    Raises
+    ------
+    CoverageError
+        The run has a shortcoming that --partial does not accept.
+    """
+    request = prepared_surface.request
+    shortcoming = shortcoming_of(tally, prepared_surface.setup.doubts, request.out, progress)
+    write_finished(request.out, checkpoint.key, shortcoming)
     checkpoint.remove()
-    return _accepted(request, DsmResult(out, tally.coverage), shortcoming)
+    return _accepted(request, DsmResult(request.out, tally.coverage), shortcoming)
 
 
 def _checked_plan(request: DsmRequest, config: RunConfig, run: OpenRun, setup: RunSetup, tiles: Sequence[Tile]) -> Plan:

@@ -27,7 +27,7 @@ from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 from zlocus.matching.tile import TileResult, match_tile
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
-from zlocus.pipeline.execution.event_log import NAME, EventLog
+from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most
 from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run_tasks
 from zlocus.pipeline.run_plan import Plan
@@ -108,10 +108,10 @@ class TileRun:
             if first is not None and first.error is not None:
                 self.log.remove()
                 raise first.error
-            raise StoppedError(f"{self._not_all(failed_outcomes)} Nothing was made.")
+            raise StoppedError(f"{self.what_failed(failed_outcomes)} Nothing was made.")
         if not partial:
             raise StoppedError(
-                f"{self._not_all(failed_outcomes)} The others are kept in {self.checkpoint.folder}: give the same "
+                f"{self.what_failed(failed_outcomes)} The others are kept in {self.checkpoint.folder}: give the same "
                 "command again to try those once more, or add --partial for a surface without them."
             )
 
@@ -126,13 +126,14 @@ class TileRun:
         self.log.add("ended", coverage=round(tally.coverage, 6), failed=len(failed_outcomes))
         if failed_outcomes:
             raise StoppedError(
-                f"{self._not_all(failed_outcomes)} They are empty in the surface (FAILED in quality.tif): give the "
+                f"{self.what_failed(failed_outcomes)} They are empty in the surface (FAILED in quality.tif): give the "
                 "same command again to try them once more."
             )
 
-    def _not_all(self, failed_outcomes: Sequence[Outcome]) -> str:
+    def what_failed(self, failed_outcomes: Sequence[Outcome]) -> str:
+        """Which tiles failed, and why, as a sentence."""
         said = [
-            f"{place_of(self.tile_job.match_scene, outcome.task.core_window)}: {_reason(outcome.failure)}"
+            f"{place_of(self.tile_job.match_scene, outcome.task.core_window)}: {_reason(outcome.failure, self.log)}"
             for outcome in failed_outcomes[:MAX_NAMED_TILES]
         ]
         more = f"; and {len(failed_outcomes) - MAX_NAMED_TILES} more" if len(failed_outcomes) > MAX_NAMED_TILES else ""
@@ -281,10 +282,10 @@ def place_of(match_scene: MatchScene, core_window: CellWindow) -> str:
     return f"E {west:.0f} to {east:.0f} m, N {south:.0f} to {north:.0f} m"
 
 
-def _reason(failure: Failure | None) -> str:
+def _reason(failure: Failure | None, log: EventLog) -> str:
     assert failure is not None, "callers pass failed outcomes only"
     if failure.trace:
-        return f"{failure.reason} (a fault of zlocus, not of the input: report it with what {NAME} says of it)"
+        return f"{failure.reason} (a fault of zlocus, not of the input: report it with what {log.path.name} says of it)"
     return failure.reason
 
 

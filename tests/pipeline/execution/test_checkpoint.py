@@ -227,3 +227,43 @@ def test_differences_by_hand():
     assert difference({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 2}}) == ""
     assert difference({"b": {"c": 2}}, {"b": {"c": 2, "d": 3}}) == "b.d was null there and is 3 now"
     assert "..." in difference({"a": "x" * 100}, {"a": ""})
+
+
+def test_processes_join_a_run_and_keep_tiles_side_by_side(tmp_path):
+    """Each has a list of its own, a run that needs the folder for itself is kept out, and both see all tiles after."""
+    filled(tmp_path)
+    one, other = store(tmp_path), store(tmp_path)
+    with one.joined("1"), other.joined("1"):
+        one.keep("64_0", ARRAYS)
+        other.keep("64_0", ARRAYS)
+        other.keep("64_64", ARRAYS)
+        with pytest.raises(OutputError, match="Another run writes to"), store(tmp_path).open("s"):
+            pass
+    everything = {"0_0", "0_64", "64_0", "64_64"}
+    assert set(one.finished) == set(other.finished) == set(store(tmp_path).finished) == everything
+    assert len(list((tmp_path / FOLDER).glob("done*.jsonl"))) == 3
+    with store(tmp_path).open("s") as alone:
+        assert all(alone.holds(name) for name in everything)
+        with pytest.raises(OutputError, match=r"needs .* for itself"), one.joined("2"):
+            pass
+
+
+def test_a_process_that_has_joined_and_made_nothing_leaves_everything(tmp_path):
+    with store(tmp_path).open("s"):
+        pass
+    with pytest.raises(ZeroDivisionError), store(tmp_path).joined("1"):
+        raise ZeroDivisionError
+    assert (tmp_path / FOLDER / MANIFEST).exists()
+
+
+def test_of_two_different_files_of_a_tile_the_one_on_disk_counts(tmp_path):
+    """As two kinds of processors may make them of the same task."""
+    filled(tmp_path, names=())
+    one, other = store(tmp_path), store(tmp_path)
+    for first, second in ((one, other), (other, one)):
+        with first.joined("1"), second.joined("1"):
+            first.keep("0_0", ARRAYS)
+            second.keep("0_0", {"height": np.float32([int(second is one)])})
+        kept = store(tmp_path)
+        assert kept.holds("0_0")
+        np.testing.assert_array_equal(kept.load("0_0")["height"], [int(second is one)])

@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -22,8 +23,9 @@ from numpy.typing import NDArray
 from zlocus.core.errors import OutputError, StoppedError
 
 Arrays = Mapping[str, NDArray[Any]]
-# Names below the folder of a run.
+# Names below the folder of a run. Processes that make the tiles of one run together have a list of finished tiles each.
 FOLDER, MANIFEST, DONE, LOCK = "tiles", "manifest.json", "done.jsonl", "lock"
+LISTS = "done*.jsonl"
 # Arrays that were computed before the first tile: the tie points.
 BEFORE = "before.npz"
 SCHEMA = 3
@@ -33,8 +35,9 @@ SCHEMA = 3
 class TileCheckpoint:
     """The finished tiles of one run, in a folder below its results.
 
-    The folder holds a manifest of everything that the tiles depend on, the arrays computed before the first tile, a
-    list with a line for every finished tile, and a file for each tile.
+    The folder holds a manifest of everything that the tiles depend on, the arrays computed before the first tile, lists
+    with a line for every finished tile, and a file for each tile. A run has one list; of several processes that make
+    its tiles together (`joined`), each writes its own.
 
     folder : made by `open`; key : everything that the tiles depend on, by name; finished : SHA-256 of each finished
     tile, by the name of the tile; before : SHA-256 of the arrays that an earlier run of the same key computed before
@@ -52,6 +55,7 @@ class TileCheckpoint:
     check: Callable[[int], None] = lambda n_kept: None
     _lock: BinaryIO | None = None
     _is_ours: bool = False
+    _list: str = DONE
 
     @classmethod
     def of(
@@ -74,7 +78,7 @@ class TileCheckpoint:
         if overwrite or not (store.folder / MANIFEST).exists():
             return store
         manifest = _read_object(store.folder / MANIFEST)
-        listed = _finished_in(store.folder / DONE)
+        listed = _finished_in(store.folder)
         if manifest.get("schema") != SCHEMA or "key" not in manifest:
             differs = "its manifest is damaged, or of another version of zlocus"
         else:
@@ -112,7 +116,7 @@ class TileCheckpoint:
         self.check(len(self.finished))
         with _written(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.folder / LOCK).open("wb")
+            self._lock = (self.folder / LOCK).open("a+b")
         try:
             if not _locked(self._lock):
                 raise OutputError(f"Another run writes to {self.folder.parent}. Wait for it, or choose another folder.")
@@ -127,12 +131,37 @@ class TileCheckpoint:
         finally:
             self._lock.close()
 
+    @contextmanager
+    def joined(self, name: str) -> Iterator[TileCheckpoint]:
+        """Make tiles of the run beside other processes that have joined it; runs that `open` the folder are kept out.
+
+        name : of the list of the tiles that this process finishes, together with a number that no other one has.
+
+        Raises
+        ------
+        OutputError
+            A run has the folder for itself, or the folder cannot be written.
+        """
+        with _written(self.folder):
+            self._lock = (self.folder / LOCK).open("a+b")
+        self._list = f"done.{name}.{secrets.token_hex(4)}.jsonl"
+        try:
+            if not _locked(self._lock, is_shared=True):
+                raise OutputError(
+                    f"A run that needs {self.folder.parent} for itself writes to it. Give the same command again when "
+                    "it has ended."
+                )
+            yield self
+        finally:
+            self.count_from_disk()
+            self._lock.close()
+
     def _begin(self, setup_digest: str, before: Arrays) -> None:
         self._is_ours = True
         if self.finished:
             manifest = _read_object(self.folder / MANIFEST)
             # Another run may have written here since the store was looked at.
-            self.finished = _finished_in(self.folder / DONE) if manifest.get("key") == self.key else {}
+            self.finished = _finished_in(self.folder) if manifest.get("key") == self.key else {}
             if self.finished and manifest.get("setup") != setup_digest:
                 raise OutputError(
                     f"{self.folder} holds {len(self.finished)} finished tiles for other cameras and heights, as they "
@@ -160,7 +189,7 @@ class TileCheckpoint:
         content, digest = _packed(arrays)
         try:
             write_atomically(self._path(name), content)
-            with (self.folder / DONE).open("ab") as done:
+            with (self.folder / self._list).open("ab") as done:
                 done.write(json.dumps({"tile": name, "sha256": digest}).encode() + b"\n")
                 done.flush()
                 os.fsync(done.fileno())
@@ -185,11 +214,11 @@ class TileCheckpoint:
         return name in self.finished and self.load(name) is not None
 
     def count_from_disk(self) -> None:
-        """Take over the finished tiles that the list on disk names.
+        """Take over the finished tiles that the lists on disk name.
 
         An interrupt may come between the line of a tile on disk and its entry in `finished`.
         """
-        self.finished |= _finished_in(self.folder / DONE)
+        self.finished |= _finished_in(self.folder)
 
     @property
     def is_there(self) -> bool:
@@ -251,7 +280,8 @@ def _shown(value: Any) -> str:
 
 def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """Write a file to a temporary name beside it, to the disk, and rename it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Processes of other machines may have the same number.
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.{os.getpid()}.part")
     try:
         with part.open("wb") as file:
             file.write(content)
@@ -271,28 +301,46 @@ def _read_object(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _finished_in(path: Path) -> dict[str, str]:
-    """SHA-256 of each tile in the list; damaged lines, or a last line that was cut off, are skipped."""
-    found: dict[str, str] = {}
+def _finished_in(folder: Path) -> dict[str, str]:
+    """SHA-256 of each finished tile in the lists of a folder; damaged lines, or a last line that was cut off, are
+    skipped.
+
+    Where two processes have made the same tile with different bytes, as different processors may, the file says which
+    of both was the last.
+    """
+    found: dict[str, set[str]] = {}
+    for path in sorted(folder.glob(LISTS)):
+        with suppress(OSError):
+            for line in path.read_bytes().splitlines():
+                with suppress(ValueError, KeyError, TypeError):
+                    record = json.loads(line)
+                    found.setdefault(str(record["tile"]), set()).add(str(record["sha256"]))
+    return {
+        name: digests.pop() if len(digests) == 1 else _that_of_file(folder / f"{name}.npz", digests)
+        for name, digests in found.items()
+    }
+
+
+def _that_of_file(path: Path, digests: set[str]) -> str:
+    """Which of several SHA-256 is that of a file; any where none is, or the file cannot be read."""
     try:
-        lines = path.read_bytes().splitlines()
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
-        return found
-    for line in lines:
-        with suppress(ValueError, KeyError, TypeError):
-            record = json.loads(line)
-            found[str(record["tile"])] = str(record["sha256"])
-    return found
+        return max(digests)
+    return digest if digest in digests else max(digests)
 
 
-def _locked(file: BinaryIO) -> bool:
-    """Lock a file until it is closed or the process ends; False where another process holds it, True without locks."""
+def _locked(file: BinaryIO, is_shared: bool = False) -> bool:
+    """Lock a file until it is closed or the process ends; False where another process holds it, True without locks.
+
+    is_shared : whether others may hold a shared lock at the same time.
+    """
     try:
         import fcntl
     except ImportError:
         return True
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # some network disks have none

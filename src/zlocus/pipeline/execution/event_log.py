@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,10 +15,10 @@ LOGGER = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Appends events to `NAME` in a folder. A line that cannot be written is skipped, because the log only informs."""
+    """Appends events to a file in a folder. A line that cannot be written is skipped, because the log only informs."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
+    def __init__(self, folder: Path, name: str = NAME) -> None:
+        self.path = folder / name
 
     def remove(self) -> None:
         """Remove the log of an earlier run."""
@@ -30,3 +31,21 @@ class EventLog:
         LOGGER.debug("Event %s: %s", event, ", ".join(f"{name} {value}" for name, value in more.items()))
         with suppress(OSError), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
+
+    def take_over(self, logs: Iterable[Path]) -> list[dict[str, Any]]:
+        """Add the events of other logs that are not in this one yet, sort all by their time, and return them.
+
+        Lines that are damaged are left out.
+        """
+        events: dict[str, dict[str, Any]] = {}
+        for path in (self.path, *logs):
+            with suppress(OSError):
+                for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+                    with suppress(ValueError):
+                        event = json.loads(line)
+                        if isinstance(event, dict) and isinstance(event.get("time"), str):
+                            events[line] = event
+        lines = sorted(events, key=lambda line: str(events[line]["time"]))
+        with suppress(OSError):
+            self.path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        return [events[line] for line in lines]
