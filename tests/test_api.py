@@ -1,19 +1,27 @@
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 import rasterio
+import xarray
 from pyproj import CRS
 from scipy.ndimage import uniform_filter
 
 import zlocus
+import zlocus.api
 from rendered_scenes import CENTRE, GSD_M, HEIGHTS, PART, SMALL_TILES, read, rendered_in_colours, run
+from zlocus.core import errors
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.options import SemiGlobalOptions
+from zlocus.core.requests import DsmRequest
 from zlocus.matching.quality import Quality
 from zlocus.synthetic.terrain import analytic_height
 
@@ -55,28 +63,14 @@ def test_a_surface_of_colour_images(tmp_path):
     assert surface.height.dims == ("y", "x")
 
 
-def test_rasters_written_from_a_surface_know_what_is_missing(written, tmp_path):
-    surface = zlocus.open_surface(written)
-    for name, nodata in (("height", np.nan), ("views", 0)):
-        surface[name].rio.to_raster(tmp_path / f"{name}.tif")
-        with rasterio.open(tmp_path / f"{name}.tif") as file:
-            assert file.nodata is not None
-            assert np.array_equal(file.nodata, nodata, equal_nan=True)
-
-
-def test_nothing_is_made_that_nobody_sees(images, monkeypatch):
+def test_nothing_is_made_that_nobody_sees(images, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", lambda request, *_: asked.append(request))
-    for more in ({}, {"products": ("hillshade",)}):
-        with pytest.raises(InputError, match=r"holds no dsm\.tif"):
+    for more in ({}, {"products": ("hillshade", "dtm")}, {"out": tmp_path / "out", "products": "dtm, laz"}):
+        with pytest.raises(InputError, match="There is no folder"):
             zlocus.match(*images("sine").inputs, **ASKED, **more)
-    assert [(request.products, request.report) for request in asked] == [((), False), (("hillshade",), False)]
-
-
-def test_flags_are_named(written):
-    surface = zlocus.open_surface(written)
-    flags = dict(zip(surface.quality.flag_meanings.split(), surface.quality.flag_masks, strict=True))
-    assert flags == {flag.name: int(flag) for flag in Quality}
+    made = [(request.products, request.report) for request in asked]
+    assert made == [((), False), ((), False), (("dtm", "laz"), True)]
 
 
 def test_products_are_kept_where_they_are_asked_for(images, tmp_path):
@@ -85,11 +79,9 @@ def test_products_are_kept_where_they_are_asked_for(images, tmp_path):
     np.testing.assert_array_equal(surface.height.values, read(tmp_path / "kept" / "dsm.tif")[0])
 
 
-def test_what_is_wrong_is_said(images, tmp_path):
-    with pytest.raises(ConfigError, match=r"does not know resolutoin\. Known are .*resolution"):
+def test_what_is_wrong_is_said(images):
+    with pytest.raises(TypeError, match="resolutoin"):
         zlocus.match(*images("sine").inputs, resolutoin=1.0)
-    with pytest.raises(InputError, match=r"holds no dsm\.tif\. Give the folder"):
-        zlocus.open_surface(tmp_path)
     with pytest.raises(InputError, match="two images or more"):
         zlocus.open_scene(images("sine").inputs[0])
     with pytest.raises(ConfigError, match="EPSG:4326"):
@@ -170,10 +162,154 @@ def test_arrays_that_do_not_fit():
 
 
 def test_the_package_is_imported_without_its_kernels():
-    code = "import sys, zlocus; assert not {'numba', 'rasterio', 'xarray'} & set(sys.modules); zlocus.match"
+    heavy = {"numba", "numpy", "rasterio", "xarray", "IPython"}
+    code = f"import sys, zlocus; dir(zlocus); assert not {heavy} & set(sys.modules); zlocus.ZlocusError; zlocus.match"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(AttributeError, match="no attribute 'mtach'"):
         _ = zlocus.mtach
+
+
+def test_every_name_can_be_had():
+    listed = set(dir(zlocus))
+    assert {*zlocus.__all__, "open", "__version__", "__path__"} <= listed
+    assert not listed & {"import_module", "TYPE_CHECKING", "annotations"}
+    assert all(getattr(zlocus, name) is not None for name in listed - {"__loader__", "__spec__"})
+    mine = {name for name, value in vars(errors).items() if isinstance(value, type)}
+    assert mine <= listed
+    assert all(issubclass(getattr(zlocus, name), zlocus.ZlocusError) for name in mine - {"ZlocusWarning"})
+    # A star import leaves Python's own `open` alone.
+    assert "open" not in zlocus.__all__
+    assert zlocus.open is zlocus.open_surface
+
+
+# What the Python interface takes in place of what a request holds.
+TAKEN = {
+    Path: zlocus.api.PathLikes, Path | None: zlocus.api.PathLikes | None, tuple[str, ...]: Sequence[str],
+}  # fmt: skip
+MORE = {
+    "crs": str | CRS | None, "vertical": zlocus.api.PathLikes, "dem_vertical": zlocus.api.PathLikes | None,
+    "out": zlocus.api.PathLikes | None,
+}  # fmt: skip
+
+
+def test_match_names_every_field_of_a_request():
+    """With its default and its type; then what is no field."""
+    hints = get_type_hints(zlocus.match, localns={"xr": xarray})
+    parameters = inspect.signature(zlocus.match).parameters
+    known = [field for field in fields(DsmRequest) if field.name != "inputs"]
+    assert list(parameters) == ["inputs", *(field.name for field in known), "config", "progress"]
+    of_request = get_type_hints(DsmRequest)
+    for field in known:
+        default = None if field.name == "out" else field.default
+        assert parameters[field.name].default == default, field.name
+        assert parameters[field.name].kind is inspect.Parameter.KEYWORD_ONLY
+        expected = MORE.get(field.name, TAKEN.get(of_request[field.name], of_request[field.name]))
+        assert hints[field.name] == expected, field.name
+
+
+def test_every_argument_of_match_reaches_the_run(images, tmp_path, monkeypatch):
+    (tmp_path / "geoid.tif").touch()
+    asked, inputs = [], images("sine").inputs
+    monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", lambda request, *_: asked.append(request))
+    every = {
+        "resolution": np.float32(0.5), "crs": CRS.from_epsg(32632), "bounds": np.array(PART), "area": "area.gpkg",
+        "mask": tmp_path / "mask.gpkg", "dem": "dem.tif", "dem_vertical": tmp_path / "geoid.tif",
+        "reference": "nadir", "views": "all", "method": "mvll", "selection": "default",
+        "vertical": tmp_path / "geoid.tif", "fill": "dem", "partial": True, "workers": np.int64(2),
+        "scheduler": "tcp://host:8786", "memory_gb": 3, "overwrite": True, "resume": False, "products": ["laz"],
+        "report": False, "out": tmp_path / "out",
+    }  # fmt: skip
+    others = {"like": "like.tif", "heights": [20, 80]}
+    for given in (every, others):
+        with pytest.raises(InputError, match=r"There is no folder|holds no run"):
+            zlocus.match(*inputs, **given)
+    expected = every | {
+        "crs": "EPSG:32632", "bounds": PART, "area": Path("area.gpkg"), "dem": Path("dem.tif"),
+        "dem_vertical": str(tmp_path / "geoid.tif"), "vertical": str(tmp_path / "geoid.tif"), "products": ("laz",),
+        "inputs": inputs, "like": None, "heights": None,
+    }  # fmt: skip
+    assert vars(asked[0]) == expected
+    assert (asked[1].like, asked[1].heights) == (Path("like.tif"), (20.0, 80.0))
+    assert {field.name for field in fields(DsmRequest)} == {*every, *others, "inputs"}
+
+
+@pytest.mark.parametrize("function", [zlocus.match, zlocus.open_scene])
+def test_inputs_that_are_no_paths_are_refused(function, monkeypatch):
+    monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", None)
+    paths = ["a.tif", "b.tif"]
+    name = f"zlocus.{function.__name__}"
+    for value in (paths, tuple(paths), set(paths), iter(paths), Path().glob("*")):
+        with pytest.raises(InputError, match=rf"Input 1 of {name} is an? .*Give {name}\(\*paths\)\.$"):
+            function(value)
+    array = np.zeros((4, 5))
+    for value in (array, xarray.DataArray(array), xarray.Dataset({"a": ("x", [1])}), 7, None, b"a.tif"):
+        with pytest.raises(InputError, match=rf"Input 2 of {name} is .*Give the paths of two images"):
+            function("a.tif", value)
+
+
+def test_wrong_arguments_are_refused_before_any_work(images, monkeypatch):
+    monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", None)
+    inputs = images("sine").inputs
+    wrong = {
+        "out": 3, "bounds": "1 2 3 4", "heights": 50.0, "config": "options.toml", "progress": "yes",
+        "resolution": "0.5", "workers": 1.5, "overwrite": "no", "crs": 32632, "like": np.zeros(3), "views": ["a"],
+        "scheduler": object(), "products": 3, "report": None,
+    }  # fmt: skip
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=rf"^{name} is .*\. Give .*\.$"):
+            zlocus.match(*inputs, **{name: value})
+    for name, value in (("bounds", (1, 2, 3)), ("heights", (1, 2, 3)), ("heights", ("low", 2))):
+        with pytest.raises(ConfigError, match=rf"^{name} (has 3 values|holds a str).* Give \d numbers"):
+            zlocus.match(*inputs, **{name: value})
+
+
+def test_a_missing_library_is_said_before_any_work(images, monkeypatch):
+    monkeypatch.setattr("zlocus.pipeline.dsm.run_dsm", None)
+    monkeypatch.setitem(sys.modules, "rioxarray", None)
+    with pytest.raises(InputError, match=r"^rioxarray is not installed\. Install it with pip"):
+        zlocus.match(*images("sine").inputs)
+
+
+def test_scenes_and_options_of_another_kind_are_refused(images):
+    scene = zlocus.open_scene(*images("sine").inputs)
+    for function in (zlocus.orient, zlocus.find_ties):
+        with pytest.raises(ConfigError, match=r"^scene is a list of 3, not a Scene\. Give zlocus\.open_scene"):
+            function(list(images("sine").inputs))
+        with pytest.raises(ConfigError, match=r"^options is a RunConfig, not an OrientationOptions"):
+            function(scene, zlocus.RunConfig())
+        with pytest.raises(ConfigError, match="empty range"):
+            function(scene, heights=(80, 20))
+
+
+def test_ties_alone_are_those_of_an_orientation(images):
+    scene = zlocus.open_scene(*images("sine").inputs, crs="EPSG:32632")
+    ties = zlocus.find_ties(scene, heights=HEIGHTS)
+    xy, view, point = (getattr(ties.observations, name) for name in ("xy", "view", "point"))
+    assert xy.shape == (len(view), 2)
+    assert point.max() == len(ties.z) - 1
+    orientation = zlocus.orient(scene, heights=HEIGHTS)
+    assert orientation.n_refined <= len(ties.z)
+    assert (np.bincount(point) >= 2).all()
+    # Seen from the cameras, a tie lies where it was found, but for the height that it was given first.
+    low, high = ties.z_range
+    assert HEIGHTS[0] <= low <= ties.z.min() <= ties.z.max() <= high <= HEIGHTS[1]
+    truth = analytic_height("sine", *(orientation.xyz[:, :2] - CENTRE).T)
+    assert np.median(np.abs(orientation.xyz[:, 2] - truth)) < STEP_M
+
+
+def test_options_are_read_from_a_file(tmp_path):
+    (tmp_path / "options.toml").write_text("[checks]\nmax_sigma_m = 1.5\n")
+    assert zlocus.read_config(tmp_path / "options.toml").checks == zlocus.CheckOptions(max_sigma_m=1.5)
+    with pytest.raises(ConfigError, match=r"^file is a dict of 0"):
+        zlocus.read_config({})
+
+
+def test_progress_is_shown_where_it_is_asked_for(images, capsys):
+    scene = zlocus.open_scene(*images("sine").inputs)
+    zlocus.find_ties(scene, heights=HEIGHTS)
+    assert capsys.readouterr().err == ""
+    zlocus.find_ties(scene, heights=HEIGHTS, progress=True)
+    assert "Tie points: done in" in capsys.readouterr().err
 
 
 def test_a_cost_by_hand():

@@ -169,6 +169,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "HeightRays": ("rays",),
     "ImageSource": ("image",),
     "LineProgress": ("progress",),
+    "NotebookProgress": ("progress",),
     "LineScanCamera": ("camera",),
     "LineScanModel": ("sensor",),
     "LineScanner": ("camera",),

@@ -10,6 +10,7 @@ Needs xarray and rioxarray: `pip install '.[xarray]'` in the clone.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -17,34 +18,31 @@ from typing import TYPE_CHECKING, Any
 
 from pyproj import CRS
 
-from zlocus.core.errors import ConfigError, InputError
+from zlocus.core import argument_checks as arguments
+from zlocus.core import request_checks
+from zlocus.core.argument_checks import path_or_none
+from zlocus.core.notebook_progress import progress_of
 from zlocus.core.options import OrientationOptions, RunConfig
-from zlocus.core.progress import Progress, SilentProgress
-from zlocus.core.requests import DsmRequest
+from zlocus.core.progress import Progress
+from zlocus.core.requests import DEFAULT_PRODUCTS, DsmRequest
 from zlocus.core.scene import Scene
+from zlocus.evaluation.arrays import evaluate
+from zlocus.io import config as config_file
 from zlocus.io import scene_file
-from zlocus.matching.array_stages import LocusStack, locus_stack, ncc_cost, semiglobal, true_ortho
-from zlocus.matching.quality import Quality
+from zlocus.matching.array_stages import SCENE_ADVICE, LocusStack, locus_stack, ncc_cost, semiglobal, true_ortho
 from zlocus.orientation.orientation import Orientation
-from zlocus.pipeline.setup import orient_views, requested_crs
+from zlocus.orientation.ties import Ties
+from zlocus.pipeline.setup import orient_views, requested_crs, ties_of_views
+from zlocus.products.surface_dataset import check_xarray, surface_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "LocusStack", "locus_stack", "match", "ncc_cost", "open_scene", "open_surface", "orient", "semiglobal",
-    "true_ortho",
+    "LocusStack", "evaluate", "find_ties", "locus_stack", "match", "ncc_cost", "open_scene", "open_surface", "orient",
+    "read_config", "semiglobal", "true_ortho",
 ]  # fmt: skip
 PathLikes = str | PathLike[str]
-# Names in the Dataset, with the file and the long name of each.
-VARIABLES = {
-    "height": ("dsm.tif", "height of the surface at the cell's centre"),
-    "sigma": ("sigma.tif", "standard deviation of the height"),
-    "quality": ("quality.tif", "reasons why a height is missing or doubtful"),
-    "views": ("views.tif", "images used"),
-    "ortho": ("ortho.tif", "grey value or colours of the view that shows the cell best"),
-}
-COLOURS = ("red", "green", "blue")
 
 
 def open_scene(*inputs: PathLikes, crs: str | CRS | None = None) -> Scene:
@@ -56,10 +54,32 @@ def open_scene(*inputs: PathLikes, crs: str | CRS | None = None) -> Scene:
     Raises
     ------
     InputError, ConfigError
-        See `zlocus.io.scene_file.open_scene`.
+        See `zlocus.io.scene_file.open_scene`. InputError: an input is no path.
     """
-    requested = crs if crs is None or isinstance(crs, CRS) else requested_crs(crs)
-    return scene_file.open_scene([Path(path) for path in inputs], requested)
+    paths = arguments.input_paths("zlocus.open_scene", inputs)
+    return scene_file.open_scene(list(paths), requested_crs(arguments.crs_or_none(crs)))
+
+
+def find_ties(
+    scene: Scene,
+    options: OrientationOptions | None = None,
+    *,
+    heights: tuple[float, float] | None = None,
+    progress: Progress | bool | None = None,
+) -> Ties:
+    """Find tie points between the images of a scene: the first step of `orient`, which also refines and uses them.
+
+    heights, progress : as of `orient`. In the result, `observations.xy` (m, 2) are the positions of image points, px,
+    `observations.view` (m,) the numbers of their images, `observations.point` (m,) those of their ties, and `z` (n,)
+    the first heights of the ties, m above the ellipsoid.
+
+    Raises
+    ------
+    GeometryError
+        The images overlap too little.
+    """
+    scene, options = _checked_scene(scene, heights), _checked_orientation_options(options)
+    return ties_of_views(scene, options, progress_of(progress))
 
 
 def orient(
@@ -67,98 +87,132 @@ def orient(
     options: OrientationOptions | None = None,
     *,
     heights: tuple[float, float] | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Orientation:
     """Find tie points and correct the cameras.
 
     `orientation.apply(scene)` is the corrected scene, `orientation.xyz` are the tie points (n, 3) m. heights : (zmin,
     zmax) m above the ellipsoid, between which tie points are searched; None: all heights that the cameras allow.
+    progress : as of `match`.
 
     Raises
     ------
     GeometryError
         The images overlap too little, or their pointing is worse than can be corrected.
     """
-    scene = replace(scene, heights=heights or scene.heights)
-    return orient_views(scene, options or OrientationOptions(), progress or SilentProgress())
+    scene, options = _checked_scene(scene, heights), _checked_orientation_options(options)
+    return orient_views(scene, options, progress_of(progress))
 
 
 def match(
-    *inputs: PathLikes,
-    out: PathLikes | None = None,
-    config: RunConfig | None = None,
-    progress: Progress | None = None,
-    **request: Any,
-) -> xr.Dataset:
+    *inputs: PathLikes, out: PathLikes | None = None, resolution: float | None = None, crs: str | CRS | None = None,
+    bounds: tuple[float, float, float, float] | None = None, like: PathLikes | None = None,
+    area: PathLikes | None = None, mask: PathLikes | None = None, heights: tuple[float, float] | None = None,
+    dem: PathLikes | None = None, dem_vertical: PathLikes | None = None, reference: str | None = None,
+    views: str = "auto", method: str = "mvll-sgm", selection: str = "default", vertical: PathLikes = "ellipsoid",
+    fill: str = "none", partial: bool = False, workers: int | None = None, scheduler: str | None = None,
+    memory_gb: float | None = None, overwrite: bool = False, resume: bool = True,
+    products: Sequence[str] = DEFAULT_PRODUCTS, report: bool = True, config: RunConfig | None = None,
+    progress: Progress | bool | None = None,
+) -> xr.Dataset:  # fmt: skip
     """Make the surface of a scene as `zlocus dsm` does, and return it as a Dataset (see `open_surface`).
 
     inputs : two images or more with RPC, or one `scene.yaml`. out : folder for the products, from which
     values are read when they are needed; None: no files are kept, and the Dataset is in memory. Where the folder holds
-    the same finished surface already, it is opened; another run is refused unless `overwrite=True` is given. request :
-    fields of `zlocus.core.requests.DsmRequest`, such as resolution, bounds, heights, workers; those that name files
-    take paths.
+    the same finished surface already, it is opened; another run is refused unless `overwrite=True` is given. config :
+    options of the stages. progress : None shows the progress in a notebook only, True also in a script, False nowhere;
+    or a progress of your own. products, report : made with `out` only. All others are the fields of
+    `zlocus.core.requests.DsmRequest`, which are the options of `zlocus dsm`.
 
     Raises
     ------
     InputError, ConfigError, GeometryError, OutputError, StoppedError, CoverageError
-        As `zlocus dsm`. OutputError: `out` holds another run. CoverageError: too few cells have a height; the
-        products are in `out`.
+        As `zlocus dsm`. InputError: xarray is not installed, or an input is no path. OutputError: `out` holds another
+        run. CoverageError: too few cells have a height; the products are in `out`.
     """
-    from zlocus.pipeline.dsm import run_dsm
-
-    known = {field for field in DsmRequest.__dataclass_fields__ if field not in ("inputs", "out")}
-    if unknown := sorted(set(request) - known):
-        raise ConfigError(f"match() does not know {', '.join(unknown)}. Known are {', '.join(sorted(known))}.")
-    for name in ("like", "area", "mask", "dem"):
-        if request.get(name) is not None:
-            request[name] = Path(request[name])
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "surface" if out is None else Path(out)
-        if out is None:  # nobody would see maps and report
-            request = {"products": (), "report": False} | request
-        dsm_request = DsmRequest(inputs=tuple(Path(path) for path in inputs), out=folder, **request)
-        run_dsm(dsm_request, config or RunConfig(), progress or SilentProgress())
-        surface = open_surface(folder)
-        return surface.load() if out is None else surface
+    check_xarray()
+    request = DsmRequest(
+        inputs=arguments.input_paths("zlocus.match", inputs), out=path_or_none("out", out, "folder") or Path(),
+        resolution=arguments.number_or_none("resolution", resolution), crs=arguments.crs_or_none(crs),
+        bounds=arguments.bounds_or_none(bounds), like=path_or_none("like", like, "raster"),
+        area=path_or_none("area", area, "file of polygons"), mask=path_or_none("mask", mask, "file of polygons"),
+        heights=arguments.heights_or_none(heights), dem=path_or_none("dem", dem, "raster"),
+        dem_vertical=arguments.text_or_none("dem_vertical", dem_vertical),
+        reference=arguments.text_or_none("reference", reference), views=arguments.text_of("views", views),
+        method=arguments.text_of("method", method), selection=arguments.text_of("selection", selection),
+        vertical=arguments.text_of("vertical", vertical), fill=arguments.text_of("fill", fill),
+        partial=arguments.flag_of("partial", partial), workers=arguments.count_or_none("workers", workers),
+        scheduler=arguments.text_or_none("scheduler", scheduler),
+        memory_gb=arguments.number_or_none("memory_gb", memory_gb), overwrite=arguments.flag_of("overwrite", overwrite),
+        resume=arguments.flag_of("resume", resume), products=arguments.names_of("products", products),
+        report=arguments.flag_of("report", report),
+    )  # fmt: skip
+    return _matched(request, out is not None, _checked_config(config), progress_of(progress))
 
 
 def open_surface(folder: PathLikes) -> xr.Dataset:
-    """Open the result of `zlocus dsm` in a folder as a Dataset.
+    """Open the result of `zlocus dsm` in a folder as a Dataset. `zlocus.open` is the same function.
 
     Its variables are height and sigma (m), quality (bit flags), views and ortho, over y and x; the ortho-image of
-    colour images also over band (red, green, blue). A missing height is NaN. `zlocus.matching.quality.Quality` names
-    the flags. Cells are read when they are needed. `surface.rio.crs` is the CRS.
+    colour images also over band (red, green, blue). A missing height is NaN. `zlocus.Quality` names the flags. Cells
+    are read when they are needed. `surface.rio.crs` is the CRS. `surface.attrs` says what the surface is: crs,
+    vertical_datum, resolution_m, method, source_images (one path a line), config (the request and all options, as
+    JSON), options_sha256, source (the version), created, and run (the folder).
 
     Raises
     ------
     InputError
-        The folder holds no such result, or xarray and rioxarray are not installed.
+        The folder holds no surface, and what it holds instead; or xarray and rioxarray are not installed.
     """
-    try:
-        import rioxarray
-        import xarray as xr
-    except ImportError as error:
-        raise InputError(
-            f"{error.name} is not installed. Install it with pip, or all that is needed with `pip install '.[xarray]'` "
-            "in the clone of zlocus."
-        ) from error
-    folder = Path(folder)
-    found = {}
-    for name, (file, long_name) in VARIABLES.items():
-        if not (folder / file).is_file():
-            raise InputError(f"{folder} holds no {file}. Give the folder that a finished `zlocus dsm` wrote.")
-        raster = rioxarray.open_rasterio(folder / file)
-        assert isinstance(raster, xr.DataArray)
-        nodata = raster.rio.nodata
-        if raster.sizes["band"] == 1:
-            raster = raster.squeeze("band", drop=True)
-        else:
-            raster = raster.assign_coords(band=list(COLOURS))
-        raster.attrs = {"long_name": long_name, **({"units": "m"} if name in ("height", "sigma") else {})}
-        found[name] = raster if nodata is None else raster.rio.write_nodata(nodata)
-    flags = [flag for flag in Quality if flag.name]
-    found["quality"].attrs |= {
-        "flag_masks": [int(flag) for flag in flags],
-        "flag_meanings": " ".join(str(flag.name) for flag in flags),
-    }
-    return xr.Dataset(found)
+    return surface_dataset(arguments.path_of("folder", folder, "folder that `zlocus dsm` wrote"))
+
+
+# Short as `zlocus.open(OUT)`. It is handed out by the package as an attribute; no module here calls it by this name.
+open = open_surface
+
+
+def read_config(file: PathLikes) -> RunConfig:
+    """Options of all stages from a file that `zlocus config` wrote, in TOML or YAML.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or holds an option that is not known or out of range.
+    """
+    return config_file.read_config(arguments.path_of("file", file, "configuration file"))
+
+
+def _matched(request: DsmRequest, keeps: bool, config: RunConfig, progress: Progress) -> xr.Dataset:
+    """The surface of a request, which is only in memory unless its folder is kept."""
+    from zlocus.pipeline.dsm import run_dsm
+
+    if keeps:
+        run_dsm(request, config, progress)
+        return surface_dataset(request.out)
+    with tempfile.TemporaryDirectory() as scratch:
+        # Nobody would see maps and report.
+        request = replace(request, out=Path(scratch) / "surface", products=(), report=False)
+        run_dsm(request, config, progress)
+        return surface_dataset(request.out, keeps_folder=False).load()
+
+
+def _checked_scene(scene: Any, heights: Any) -> Scene:
+    """The scene, with the heights that are given or its own."""
+    given = arguments.heights_or_none(heights)
+    request_checks.check_heights(given)
+    checked = arguments.instance_of("scene", scene, Scene, SCENE_ADVICE)
+    return replace(checked, heights=given or checked.heights)
+
+
+def _checked_orientation_options(options: Any) -> OrientationOptions:
+    advice = "Give zlocus.OrientationOptions(...)."
+    return (
+        OrientationOptions()
+        if options is None
+        else arguments.instance_of("options", options, OrientationOptions, advice)
+    )
+
+
+def _checked_config(config: Any) -> RunConfig:
+    advice = "Give zlocus.RunConfig(...), or zlocus.read_config(FILE)."
+    return RunConfig() if config is None else arguments.instance_of("config", config, RunConfig, advice)

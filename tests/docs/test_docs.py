@@ -95,6 +95,7 @@ STAGES = re.findall(
     (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"),
     re.MULTILINE,
 )
+FUNCTIONS = {name for name in zlocus.__all__ if name.islower() and not name.startswith("_")}
 # Folders in pages that are not those of the repository.
 NOT_OURS = {"cameras/", "point/", "scene/", "surface/", "sparse/"}
 # Keys of run.json that begin like an option.
@@ -118,11 +119,20 @@ def documented(path: str) -> list[str]:
 
 
 def test_stages_are_listed():
-    assert len(STAGES) == len(set(STAGES)) == 18
+    assert len(STAGES) == len(set(STAGES)) == 19
     own = {path for path in STAGES if path.count(".") == 1}
-    assert own == {f"zlocus.{name}" for name in zlocus.__all__} - {
-        "zlocus.LocusStack", "zlocus.__version__", "zlocus.match", "zlocus.open_scene", "zlocus.open_surface",
+    assert own == {f"zlocus.{name}" for name in FUNCTIONS} - {
+        "zlocus.is_empty", "zlocus.match", "zlocus.open_scene", "zlocus.open_surface", "zlocus.read_config",
     }  # fmt: skip
+
+
+def test_every_function_is_listed_and_every_stage_has_an_example():
+    """`tests/docs/test_docs_commands.py` runs the examples."""
+    page = (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| \{py:func\}`zlocus\.([a-z_]+) <", page, re.MULTILINE))
+    assert listed == FUNCTIONS - {"is_empty", "open_surface"} | {"open"}
+    shown = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
+    assert {name for name in listed if f"zlocus.{name}(" in shown} == listed - {"read_config"}
 
 
 @pytest.mark.parametrize("path", STAGES)

@@ -147,10 +147,24 @@ def evaluate(dsm: Path, comparison: Comparison) -> Evaluation:
     ConfigError
         The raster of classes is on another grid, or a geoid is given that is not needed.
     """
-    compared = same_heights(read_heights(dsm), read_heights(comparison.reference), comparison.geoid)
+    surface, reference = read_heights(dsm), read_heights(comparison.reference)
+    classes = None if comparison.classes is None else read_classes(comparison.classes, reference)
+    return evaluate_rasters(surface, reference, comparison, classes)
+
+
+def evaluate_rasters(
+    surface: HeightRaster, reference: HeightRaster, comparison: Comparison, classes: NDArray[np.uint8] | None = None
+) -> Evaluation:
+    """The same for rasters that are in memory already. classes : (r, c) on the reference's grid, or None.
+
+    Raises
+    ------
+    InputError, ConfigError
+        See `evaluate`.
+    """
+    compared = same_heights(surface, reference, comparison.geoid)
     surface, reference = compared.surface, compared.reference
     frame = frame_of(surface, reference)
-    classes = None if comparison.classes is None else read_classes(comparison.classes, reference)
     truth = truth_blocks(reference, comparison.margin_m, classes, frame)
     points = points_on(surface, reference, frame, truth.xy, truth.size, truth.is_edge)
     _check_overlap(surface, reference, points)

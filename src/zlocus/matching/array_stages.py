@@ -14,6 +14,15 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from zlocus.core.argument_checks import (
+    bounds_or_none,
+    count_or_none,
+    instance_of,
+    kind_of,
+    numeric_array,
+    positions,
+    positive_number,
+)
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import PyramidOptions, SemiGlobalOptions
 from zlocus.core.scene import ImageSource, Scene
@@ -33,6 +42,9 @@ COST_UNIT, MAX_COST = 64.0, 255.0
 ALL_VALID = 1e-3
 # A window whose variance is below this share of the variance of the whole image has no texture: it is rounding.
 MIN_TEXTURE = 1e-9
+# Distances between cells may differ by this share of a cell, by rounding.
+EVEN = 1e-3
+SCENE_ADVICE = "Give zlocus.open_scene(*paths)."
 
 
 @dataclass(frozen=True)
@@ -62,15 +74,21 @@ def locus_stack(
 ) -> LocusStack:
     """Resample the images of a scene (cubic) along the vertical lines of the cells of an area: the vertical line loci.
 
-    For looking at loci and for costs of one's own; the matcher itself never holds so much at once. bounds : (xmin,
-    ymin, xmax, ymax) m in the scene's frame; resolution : m; heights : (h,) m above the ellipsoid. Source: Ji et al.
-    (2014), section 2 (MVLL).
+    For looking at loci and for costs of one's own; the matcher itself never holds so much at once: 4 i h r c bytes.
+    scene : of i views, with corrected cameras (`orient`). bounds : (xmin, ymin, xmax, ymax) m in the scene's frame;
+    resolution : side of a cell, m; heights : (h,) m above the ellipsoid. Source: Ji et al. (2014), section 2 (MVLL).
 
     Raises
     ------
     ConfigError
-        There are no cells or no heights.
+        There are no cells or no heights, or an argument is of another kind.
     """
+    scene = instance_of("scene", scene, Scene, SCENE_ADVICE)
+    checked_bounds = bounds_or_none(bounds)
+    if checked_bounds is None:
+        raise ConfigError("bounds is None. Give 4 numbers: (xmin, ymin, xmax, ymax).")
+    bounds, resolution = checked_bounds, positive_number("resolution", resolution, "m")
+    heights = positions("heights", heights, "heights").tolist()
     across, down = (round((bounds[k + 2] - bounds[k]) / resolution) for k in (0, 1))
     if min(across, down, len(heights)) < 1:
         raise ConfigError(f"{down} x {across} cells at {len(heights)} heights hold nothing. Give more of each.")
@@ -109,10 +127,11 @@ def _sampled(image: ImageSource, xy: NDArray[np.float64]) -> NDArray[np.float32]
 def ncc_cost(grey: NDArray[np.floating], *, window: int = 5, reference: int | None = None) -> NDArray[np.float32]:
     """Matching cost of every cell at every height: 1 - NCC, averaged over pairs of images.
 
-    grey : (i, h, r, c), as of `locus_stack`, NaN where an image does not show a place. window : side of the square
-    correlation window, odd. reference : number of the image that the others are compared with, whose mean is the
-    SNCC of Ji et al. (2014), section 2.1; None: all pairs are. Returns (r, c, h) float32, in the units of `semiglobal`;
-    NaN where fewer than two images show the whole window. A window without texture costs 1 against every other.
+    grey : (i, h, r, c) of any unit, as of `locus_stack`, NaN where an image does not show a place; NCC ignores gain and
+    offset. window : side of the square correlation window, cells, odd. reference : number of the image that the others
+    are compared with, whose mean is the SNCC of Ji et al. (2014), section 2.1; None: all pairs are. Returns (r, c, h)
+    float32, in the units of `semiglobal`; NaN where fewer than two images show the whole window. A window without
+    texture costs 1 against every other.
 
     The matcher's own cost adds grey differences, and leaves out occluded images: `zlocus.matching.cost_volume`.
 
@@ -121,8 +140,10 @@ def ncc_cost(grey: NDArray[np.floating], *, window: int = 5, reference: int | No
     ConfigError
         The array or the window does not fit.
     """
-    if grey.ndim != 4 or len(grey) < 2:
+    grey = numeric_array("grey", grey, "images, heights, rows, columns")
+    if len(grey) < 2 or min(grey.shape) < 1:
         raise ConfigError(f"The images are {grey.shape}. Give (images, heights, rows, columns) of two images or more.")
+    window, reference = _whole("window", window), count_or_none("reference", reference)
     if window < 3 or window % 2 == 0 or (reference is not None and not 0 <= reference < len(grey)):
         raise ConfigError(
             f"A window of {window} and reference {reference} do not fit {len(grey)} images. Give an odd window of 3 or "
@@ -175,16 +196,21 @@ def true_ortho(
     Raises
     ------
     ConfigError
-        The arrays do not fit.
+        The arrays do not fit, or are no arrays of numbers.
     GeometryError
         All images look along the same line, or their projections bend too much for the cells.
     """
+    scene = instance_of("scene", scene, Scene, SCENE_ADVICE)
+    height = np.asarray(numeric_array("height", height, "rows, columns"), np.float64)
+    x, y = positions("x", x, "columns"), positions("y", y, "rows")
     shape = (len(y), len(x))
     if height.shape != shape or min(shape) < 2 or not np.isfinite(height).any():
         raise ConfigError(
             f"Heights of {height.shape} cells, with {len(x)} x and {len(y)} y, show nothing. Give (rows, columns) of "
             "two or more each, and some heights."
         )
+    _check_even(x, y)
+    height = np.where(np.isfinite(height), height, np.nan)
     cell_m, lowest, highest = float(x[1] - x[0]), float(np.nanmin(height)), float(np.nanmax(height))
     views = reference_first(scene, (lowest + highest) / 2, None)
     options = PyramidOptions()
@@ -210,6 +236,24 @@ def true_ortho(
     return shown
 
 
+def _check_even(x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    """Refuse centres of cells that are no square grid with columns to the east and rows to the south."""
+    cell_m = float(x[1] - x[0])
+    steps = np.concatenate([np.diff(x), -np.diff(y)])
+    if cell_m <= 0 or np.abs(steps - cell_m).max() > EVEN * cell_m:
+        raise ConfigError(
+            f"x and y are no centres of square cells from west to east and from north to south: their steps range from "
+            f"{steps.min():g} to {steps.max():g} m. Give evenly spaced ones, x rising and y falling."
+        )
+
+
+def _whole(name: str, value: int) -> int:
+    number = count_or_none(name, value)
+    if number is None:
+        raise ConfigError(f"{name} is {kind_of(value)}. Give a whole number.")
+    return number
+
+
 def semiglobal(
     cost: NDArray[np.floating],
     *,
@@ -221,21 +265,29 @@ def semiglobal(
     """Heights by the semi-global constraint on a matching cost of one's own.
 
     cost : (r, c, h) in units of 1 - NCC: 0 where all images agree, NaN where it is unknown and taken as 1. The
-    penalties are made for these units. ortho : (r, c) grey values, at whose edges heights may jump. step_cells : a
-    height step over the side of a cell. n_images : that the cost compares; the more they are, the smaller is P1.
-    Heights come back as indices into h; `vertex` is the one between steps.
+    penalties are made for these units. Evenly spaced heights. ortho : (r, c) grey values of any unit, at whose edges
+    heights may jump, NaN where there is none. step_cells : a height step over the side of a cell. n_images : that the
+    cost compares; the more they are, the smaller is P1. Heights come back as indices into h (r, c); `vertex` is the one
+    between steps, so that the height is `heights[0] + step * vertex`.
 
     Raises
     ------
     ConfigError
-        The arrays do not fit.
+        The arrays do not fit, or are no arrays of numbers.
     """
-    if cost.ndim != 3 or min(cost.shape) < 1:
+    cost = numeric_array("cost", cost, "rows, columns, heights")
+    if min(cost.shape) < 1:
         raise ConfigError(f"The cost has the shape {cost.shape}. Give one of (rows, columns, heights).")
     shape = cost.shape[:2]
-    if ortho is not None and ortho.shape != shape:
-        raise ConfigError(f"The ortho-image has {ortho.shape} cells, the cost {shape}. Give both on one grid.")
-    options = options or SemiGlobalOptions()
+    if ortho is not None:
+        ortho = np.asarray(numeric_array("ortho", ortho, "rows, columns"), np.float32)
+        if ortho.shape != shape:
+            raise ConfigError(f"The ortho-image has {ortho.shape} cells, the cost {shape}. Give both on one grid.")
+    advice = "Give zlocus.SemiGlobalOptions(...)."
+    options = SemiGlobalOptions() if options is None else instance_of("options", options, SemiGlobalOptions, advice)
+    step_cells, n_images = positive_number("step_cells", step_cells, "cells"), _whole("n_images", n_images)
+    if n_images < PAIR:
+        raise ConfigError(f"n_images is {n_images}, and a cost compares {PAIR} or more. Give their number.")
     counted = np.rint(np.where(np.isfinite(cost), cost, 1.0) * COST_UNIT).clip(0, MAX_COST).astype(np.uint8)
     lattice = HeightLattice(
         0.0, 1.0, shape, max(shape), np.zeros((1, 1), np.int64), np.full((1, 1), cost.shape[2], np.int64)

@@ -12,7 +12,7 @@ Matching in image space needs no grid: `zlocus.pipeline.image_tiles` replaces th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +37,7 @@ from zlocus.core.footprints import (
 from zlocus.core.grid import Grid, grid_from_bounds, grid_from_geobox
 from zlocus.core.height_range import HeightRange
 from zlocus.core.options import OrientationOptions, PyramidOptions, RunConfig
-from zlocus.core.progress import Progress, SilentProgress
+from zlocus.core.progress import Progress, SilentProgress, Stage
 from zlocus.core.request_checks import is_scene_file
 from zlocus.core.requests import SetupRequest
 from zlocus.core.resources import cores
@@ -55,6 +55,7 @@ from zlocus.orientation.orientation import Orientation, OrientationRequest, orie
 from zlocus.orientation.plausibility import Doubt
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
+from zlocus.orientation.ties import Ties, find_ties
 from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
 from zlocus.pipeline.messages import note_dem, note_doubts, some_names
 from zlocus.pipeline.request_fit import check_bounds_in_metres, check_heights_of_cameras
@@ -196,21 +197,35 @@ def orient_views(
 
     control, terrain, known_ties : see `OrientationRequest`; threads : None uses every core.
     """
-    heights = scene.heights
-    if heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
-        heights = heights_below_cameras(scene)
-    with progress.stage("Tie points", 1.0) as stage:
-        done = 0.0
+    with progress.stage("Tie points", 1.0) as stage, opencv_in_one_thread():
+        request = OrientationRequest(_heights_of_ties(scene), control, terrain, known_ties)
+        return orient(scene, options, request, _report_to(stage), threads or cores())
 
-        def report(step: str, share: float) -> None:
-            nonlocal done
-            start, length = TIE_STEPS[step]
-            stage.advance(start + length * share - done)
-            done = start + length * share
 
-        with opencv_in_one_thread():
-            request = OrientationRequest(heights, control, terrain, known_ties)
-            return orient(scene, options, request, report, threads or cores())
+def ties_of_views(scene: Scene, options: OrientationOptions, progress: Progress) -> Ties:
+    """Find the tie points of a scene, as the first step of `orient_views` does, without a correction."""
+    with progress.stage("Tie points", 1.0) as stage, opencv_in_one_thread():
+        return find_ties(scene, options, _heights_of_ties(scene), _report_to(stage), cores())
+
+
+def _heights_of_ties(scene: Scene) -> tuple[float, float] | None:
+    """Heights at which tie points are searched; None: those for which the sensor models were made."""
+    if scene.heights is None and all(view.sensor.height_bounds() is None for view in scene.views):
+        return heights_below_cameras(scene)
+    return scene.heights
+
+
+def _report_to(stage: Stage) -> Callable[[str, float], None]:
+    """A function that advances the stage of the tie points when a share of one of its steps is done."""
+    done = 0.0
+
+    def report(step: str, share: float) -> None:
+        nonlocal done
+        start, length = TIE_STEPS[step]
+        stage.advance(start + length * share - done)
+        done = start + length * share
+
+    return report
 
 
 @contextmanager
