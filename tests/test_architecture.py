@@ -222,6 +222,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "AxisGrid": ("axis_grid", "x", "y"),
     "BlockGrid": ("block_grid", "low", "middle", "high"),
     "ChosenViews": ("chosen_views", "chosen"),
+    "ComparedSurface": ("surface", "first", "second"),
     "MeasuredDistances": ("distances", "wide", "narrow"),
     "VisibleHeights": ("visible", "visible_heights", "matched", "helpful"),
     # Options are `options`, or have the name of their stage, here in the plural or as one word.

@@ -243,6 +243,7 @@ LAID_OUT = {
     "README.md": lay_out_readme,
     "docs/how-to/array_jobs.md": lay_out_images,
     "docs/how-to/cloud.md": lay_out_images_and_area,
+    "docs/how-to/compare.md": lay_out_images,
     "docs/how-to/curves.md": lay_out_images,
     "docs/how-to/doctor.md": lay_out_images,
     "docs/how-to/evaluate.md": lay_out_surfaces,

@@ -15,6 +15,7 @@ import typer
 from zlocus import __version__
 from zlocus.cli.cloud import CloudOptions, cloud
 from zlocus.cli.commands import Command, command_of
+from zlocus.cli.compare import CompareOptions, compare
 from zlocus.cli.config import ConfigOptions, config
 from zlocus.cli.console import Console, OutputOptions
 from zlocus.cli.curves import CurvesOptions, curves
@@ -49,6 +50,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("doctor", DoctorOptions, doctor),
     ("import", ImportOptions, import_cameras),
     ("evaluate", EvaluateOptions, evaluate),
+    ("compare", CompareOptions, compare),
     ("report", ReportOptions, report),
     ("inspect", InspectOptions, inspect),
     ("config", ConfigOptions, config),

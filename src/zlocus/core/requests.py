@@ -478,3 +478,4 @@ def check_output(
 
 # Beside a run, which has no file of these names, there is room for them.
 EVALUATION_FILES = ("evaluation.json", "error.tif", "histogram.png")
+COMPARISON_FILES = ("compare.html", "difference.tif")

@@ -44,6 +44,23 @@ def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = 
     return figure
 
 
+def differences_figure(
+    differences: FloatArray, statistics: ErrorStatistics, threshold_m: float, size_inches: tuple[float, float]
+) -> Figure:
+    """Figure of the share of cells per bin of the differences of two surfaces, as `histogram_figure` draws errors.
+
+    differences : (n,) m; statistics : of these.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size_inches, layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel("height in B less height in A, m")
+    axes.set_ylabel("share of the cells, %")
+    _draw(axes, differences, statistics, threshold_m, "differences")
+    return figure
+
+
 def _title(evaluation: Evaluation) -> str:
     """Completeness, which errors are drawn, and the figures of both kinds of errors beside each other."""
     complete = f"{100 * evaluation.statistics.completeness:.1f} %"
@@ -59,16 +76,18 @@ def _title(evaluation: Evaluation) -> str:
     )
 
 
-def _draw(axes: Axes, errors: FloatArray, statistics: ErrorStatistics, threshold_m: float) -> None:
+def _draw(
+    axes: Axes, errors: FloatArray, statistics: ErrorStatistics, threshold_m: float, label: str = "errors"
+) -> None:
     axis_end = AXIS_END_LE95 * statistics.le95 or threshold_m
     edges = np.linspace(-axis_end, axis_end, N_BINS + 1)
     share = 100 * np.histogram(errors, edges)[0] / errors.size
-    axes.stairs(share, edges, fill=True, color=BAR, label="errors")
+    axes.stairs(share, edges, fill=True, color=BAR, label=label)
     if statistics.nmad > 0:
         at = np.linspace(-axis_end, axis_end, 600)
         bell = np.exp(-0.5 * ((at - statistics.median) / statistics.nmad) ** 2) / (statistics.nmad * np.sqrt(2 * np.pi))
-        label = f"normal, NMAD {statistics.nmad:.3f} m"
-        axes.plot(at, 100 * bell * (edges[1] - edges[0]), color=CURVE, linewidth=1.3, label=label)
+        curve = f"normal, NMAD {statistics.nmad:.3f} m"
+        axes.plot(at, 100 * bell * (edges[1] - edges[0]), color=CURVE, linewidth=1.3, label=curve)
     axes.axvline(statistics.median, color=LINE, linewidth=1, linestyle="--", label=f"median {statistics.median:+.3f} m")
     if threshold_m < axis_end:
         for limit in (-threshold_m, threshold_m):

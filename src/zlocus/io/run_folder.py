@@ -20,6 +20,7 @@ OTHER_RESULTS = {
     "ranking.json": ("a ranking of images", "zlocus rank"),
     "orientation.json": ("tie points and corrected cameras", "zlocus orient` or `zlocus ties"),
     "evaluation.json": ("an evaluation", "zlocus evaluate"),
+    "compare.html": ("a comparison", "zlocus compare"),
     "scene.yaml": ("a scene, which is an input", "zlocus import"),
 }
 ADVICE = "Give the folder that a finished `zlocus dsm` wrote (-o)."

@@ -46,6 +46,7 @@ FLAG_GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
     ("height of a fitted plane (PLANE)", Quality.PLANE, (0, 158, 115)),
     ("height with another note (JUMP, UNREFINED, IMAGE_EXCLUDED)", Quality(0xFFFF), (240, 228, 66)),
 )
+ERROR_ALT = "Error of height: red where the surface is too high, blue where it is too low; white where it is not known."
 NO_FLAG = ("height without a warning", (225, 225, 225))
 
 
@@ -93,7 +94,7 @@ def height_map(folder: Path, survey: Survey, sun_deg: tuple[float, float]) -> tu
     height, cell_m = averaged(folder / "dsm.tif", RELIEF_PX)
     low, high = span(height)
     shaded = relief(height, cell_m, (low, high), sun_deg)
-    scale = Scale(f"{survey.height_name}, m", gradient(cv2.COLORMAP_VIRIDIS), even_ticks(low, high))
+    scale = Scale(f"{survey.height_name}, m", viridis(), even_ticks(low, high))
     alt = f"Shaded relief coloured by height from {low:.1f} to {high:.1f} m; white where there is no height."
     return picture(shaded, alt), scale
 
@@ -191,13 +192,18 @@ def groups_of(code: NDArray[np.int64]) -> NDArray[np.int64]:
     return group
 
 
-def error_picture(errors: NDArray[np.float32], saturated_m: float) -> tuple[Picture, Scale]:
-    """Map of errors (r, c) m, with colours that are saturated from `saturated_m` on."""
+def error_picture(
+    errors: NDArray[np.float32],
+    saturated_m: float,
+    title: str = "surface less reference, m",
+    alt: str = ERROR_ALT,
+) -> tuple[Picture, Scale]:
+    """Map of errors (r, c) m, with colours that are saturated from `saturated_m` on. title : of the legend; alt :
+    description of the picture."""
     colours = error_map(errors, saturated_m)
     line = error_map(np.linspace(-saturated_m, saturated_m, STOPS, dtype=np.float32)[None], saturated_m)[0]
     ticks = tuple(f"{value:+g}" if value else "0" for value in np.linspace(-saturated_m, saturated_m, TICKS))
-    alt = "Error of height: red where the surface is too high, blue where it is too low; white where it is not known."
-    scale = Scale("surface less reference, m", ", ".join(css(colour) for colour in line), ticks)
+    scale = Scale(title, ", ".join(css(colour) for colour in line), ticks)
     return picture(colours, alt), scale
 
 
@@ -252,6 +258,11 @@ def ramp(table: int, n: int) -> NDArray[np.uint8]:
 def gradient(table: int) -> str:
     """One of OpenCV's tables as CSS colours."""
     return ", ".join(css(colour) for colour in ramp(table, STOPS))
+
+
+def viridis() -> str:
+    """The colours of heights as CSS colours, from the lowest on."""
+    return gradient(cv2.COLORMAP_VIRIDIS)
 
 
 def css(colour: NDArray[np.uint8]) -> str:

@@ -74,8 +74,8 @@ def write_report(out: Path, comparison: Comparison | None = None) -> Path:
     return out / REPORT
 
 
-def rendered(values: Mapping[str, Any]) -> str:
-    """The page, rendered from the values of `context`."""
+def rendered(values: Mapping[str, Any], template: str = "page.html.jinja") -> str:
+    """A page, rendered from the values of its template: those of `context` for the report."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     from zlocus.products.report.compiled_page import CompiledPages
@@ -85,7 +85,7 @@ def rendered(values: Mapping[str, Any]) -> str:
         bytecode_cache=CompiledPages(HERE / "__pycache__"),
     )  # fmt: skip
     digest = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode("ascii")
-    return environment.get_template("page.html.jinja").render(**values, script=SCRIPT, script_hash=digest) + "\n"
+    return environment.get_template(template).render(**values, script=SCRIPT, script_hash=digest) + "\n"
 
 
 def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:

@@ -237,20 +237,26 @@ def request_rows(request: Mapping[str, Any]) -> list[OptionRow]:
 
 def option_rows(options: Mapping[str, Any]) -> list[OptionRow]:
     """Every option of every stage with its meaning and, where the value differs, its default."""
-    known = {name: (default, meaning) for name, default, meaning in _known(RunConfig())}
+    known = {name: (default, meaning) for name, default, meaning in known_options()}
     rows = []
-    for name, value in _flat(options):
+    for name, value in nested_values(options):
         default, meaning = known.get(name, (value, ""))
         rows.append(OptionRow(name, plain(value), "" if default == value else plain(default), meaning))
     return rows
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def nested_values(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of a nested table, by names with points between them."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from nested_values(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
+
+
+def known_options() -> Iterator[tuple[str, Any, str]]:
+    """Yield name, default and meaning of every option of every stage."""
+    return _known(RunConfig())
 
 
 def _known(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:

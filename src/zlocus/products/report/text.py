@@ -191,6 +191,15 @@ def place(survey: Survey, crs: CRS) -> tuple[str, str]:
     return where, f"{crs.name}, {code}"
 
 
+def crs_name(text: str) -> str:
+    """Name and code of the CRS of run.json, in words."""
+    crs = CRS.from_user_input(text)
+    if is_local(crs):
+        return "local frame"
+    authority = crs.to_authority()
+    return f"{crs.name}, {':'.join(authority)}" if authority else crs.name
+
+
 def summary(survey: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, float]) -> str:
     """Summary of the run in one paragraph. quantiles : of the standard deviations, m, by percent."""
     rows, cols = survey.shape
