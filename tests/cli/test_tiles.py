@@ -13,6 +13,7 @@ from zlocus.cli.dsm import DsmOptions
 from zlocus.cli.tiles import WITHOUT, TilesPlanOptions
 from zlocus.core.requests import DsmRequest
 from zlocus.pipeline.array_jobs import TaskResult
+from zlocus.pipeline.array_plan import FinishedTasks
 
 
 @pytest.fixture
@@ -31,13 +32,14 @@ def test_a_plan_has_the_options_of_a_surface():
 
 def test_options_reach_the_pipeline(zl, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr("zlocus.pipeline.array_jobs.plan_tasks", lambda *given: asked.append(given) or "planned")
+    planned = FinishedTasks(tmp_path / "out", 7)
+    monkeypatch.setattr("zlocus.pipeline.array_jobs.plan_tasks", lambda *given: asked.append(given) or planned)
     done = zl(
         "tiles", "plan", tmp_path / "out", "a.tif", "b.tif", "--tasks", 7, "--resolution", 0.5, "--heights", 1, 2,
         "--products", "dtm", "--no-report", "--memory", 2, "--overwrite",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert done.stdout == "planned\n"
+    assert done.stdout == f"{planned}\n"
     request, config, n_tasks, _ = asked[0]
     assert request == DsmRequest(
         inputs=(Path("a.tif"), Path("b.tif")), out=tmp_path / "out", resolution=0.5, heights=(1, 2), products=("dtm",),
