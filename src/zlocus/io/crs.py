@@ -89,6 +89,8 @@ def check_fits(crs: CRS, lon: float, lat: float) -> None:
     ConfigError
         Its scale differs from one by more than `MOST_SCALE_ERROR`.
     """
+    if not crs.is_projected:
+        return
     factors = Proj(crs).get_factors(lon, lat)
     scales = factors.meridional_scale, factors.parallel_scale
     if all(abs(scale - 1.0) <= MOST_SCALE_ERROR for scale in scales):
