@@ -47,12 +47,11 @@ test: lint
 test-fast: $(STAMP)
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 
-# The oldest versions that pyproject.toml allows, in an environment of their own.
+# The oldest versions that pyproject.toml allows for this Python, in an environment of their own.
 test-minimum: $(STAMP)
 	$(PYTHON) -m venv $(MINIMUM)
-	$(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-	    extra = project["optional-dependencies"]; needed = project["dependencies"] + extra["cluster"] + extra["inspect"] + extra["xarray"]; \
-	    print(*(d.split(",")[0].replace(">=", "==") for d in needed), sep="\n")' > $(MINIMUM)/versions.txt
+	$(BIN)/python tests/support/lowest_versions.py \
+	    "$$($(MINIMUM)/bin/python -c 'import sys; print(*sys.version_info[:2], sep=".")')" > $(MINIMUM)/versions.txt
 	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
 	$(MINIMUM)/bin/python -m pytest -n 2 --dist worksteal
 

@@ -298,8 +298,8 @@ def test_a_planted_second_name_is_seen(tmp_path):
     assert len(class_definitions(tmp_path)["View"]) == 2
 
 
-# Tests of whole runs, of the documentation and of the benchmarks belong to no single module.
-NOT_MIRRORED = ("runs", "docs", "benchmarks")
+# Tests of whole runs, of the documentation, of the benchmarks and of what is installed belong to no single module.
+NOT_MIRRORED = ("runs", "docs", "benchmarks", "packaging")
 # Tests of the whole package, or of several of its modules.
 OF_SEVERAL_MODULES = {"test_architecture.py", "test_kernel_signatures.py", "matching/test_stages_against_twins.py"}
 

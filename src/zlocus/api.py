@@ -4,7 +4,7 @@
     >>> surface = zlocus.match("img_1.tif", "img_2.tif", "img_3.tif", resolution=0.5)
     >>> surface.height.rio.to_raster("dsm.tif")
 
-Needs xarray and rioxarray: `pip install '.[xarray]'` in the clone.
+Needs xarray and rioxarray: `pip install xarray rioxarray`.
 """
 
 from __future__ import annotations

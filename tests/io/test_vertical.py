@@ -79,6 +79,8 @@ def test_a_missing_grid_is_an_error(no_grids, name):
     grid = KNOWN_GEOIDS[name].grids[0]
     assert f"--vertical {name} needs PROJ's grid {grid}, which is not in {no_grids}" in message
     assert f"pyproj sync --file {grid}" in message
+    # Debian's proj-data has EGM96 as egm96_15.gtx, and not EGM2008.
+    assert ("proj-data of Debian" in message) == (name == "egm96")
     assert "--vertical FILE" in message
 
 

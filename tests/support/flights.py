@@ -51,7 +51,7 @@ class Flight:
     def trajectory(self, margin=4500.0, every_rows=1.6):
         row = np.arange(-margin, ROWS + margin, every_rows)
         centres, frame_from_camera = self.pose(row)
-        return Trajectory(row * INTERVAL_S, centres, np.ascontiguousarray(frame_from_camera.mT))
+        return Trajectory(row * INTERVAL_S, centres, np.ascontiguousarray(frame_from_camera.swapaxes(-1, -2)))
 
 
 def focal_line(along_deg=0.0, bend_mm=0.0, turn_deg=0.0, columns=COLUMNS):

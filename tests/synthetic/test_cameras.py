@@ -114,7 +114,7 @@ def test_a_flight_is_shaken_in_place_and_in_every_turn() -> None:
     (place, turned), (still, at_rest) = camera.poses(rows), replace(camera, shake=None).poses(rows)
     assert camera.shake is not None
     expected = camera.shake.at(rows - camera.centre[1])
-    apart = at_rest.mT @ turned
+    apart = at_rest.swapaxes(-1, -2) @ turned
     found = np.column_stack([apart[:, 0, 2], -apart[:, 1, 2], apart[:, 1, 0]])
     # Products of a wobble of 5e-4 and a shake of 1e-4.
     np.testing.assert_allclose(found, expected[:, 3:], rtol=0, atol=3e-7)

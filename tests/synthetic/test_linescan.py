@@ -142,7 +142,7 @@ def test_noise_is_as_large_as_it_says(spec):
     np.testing.assert_array_equal(with_noise(exact, TrajectoryNoise(), rng).rotations, exact.rotations)
     found = with_noise(exact, TrajectoryNoise(offset_m=0.1, turn_deg=0.002, every_s=1.0), rng)
     assert np.std(found.centres - exact.centres) == pytest.approx(0.1, rel=0.35)
-    turns = found.rotations @ exact.rotations.mT
+    turns = found.rotations @ exact.rotations.swapaxes(-1, -2)
     assert np.rad2deg(np.std(turns[:, [0, 0, 1], [1, 2, 2]])) == pytest.approx(0.002, rel=0.35)
     # Slow: from sample to sample (5 ms) little changes; jitter does.
     assert np.abs(np.diff(found.centres - exact.centres, axis=0)).max() < 0.01

@@ -44,7 +44,7 @@ def inspect(options: InspectOptions, console: Console) -> None:
     """Look at a surface in the browser, cell by cell."""
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise ConfigError(
-            f"The inspector needs {' and '.join(missing)}, not installed here: pip install '.[inspect]' in the clone."
+            f"The inspector needs {' and '.join(missing)}, not installed here: pip install {' '.join(missing)}."
         )
     check_reference(
         options.reference,

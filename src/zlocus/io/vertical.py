@@ -36,18 +36,23 @@ class KnownGeoid:
     """A geoid for which PROJ has grids.
 
     title : its name in texts; epsg : code of the vertical CRS; datum : name of the vertical datum in a CRS; grids :
-    file names of its grids, the current ones first.
+    file names of its grids, the current ones first; packages : where proj-data has one of them, in words.
     """
 
     title: str
     epsg: int
     datum: str
     grids: tuple[str, ...]
+    packages: str
 
 
 KNOWN_GEOIDS = {
-    "egm96": KnownGeoid("EGM96", 5773, "EGM96 geoid", ("us_nga_egm96_15.tif", "egm96_15.gtx")),
-    "egm2008": KnownGeoid("EGM2008", 3855, "EGM2008 geoid", ("us_nga_egm08_25.tif", "egm08_25.gtx")),
+    "egm96": KnownGeoid(
+        "EGM96", 5773, "EGM96 geoid", ("us_nga_egm96_15.tif", "egm96_15.gtx"), "of Debian or conda-forge"
+    ),
+    "egm2008": KnownGeoid(
+        "EGM2008", 3855, "EGM2008 geoid", ("us_nga_egm08_25.tif", "egm08_25.gtx"), "of conda-forge (not Debian's)"
+    ),
 }
 
 
@@ -272,7 +277,8 @@ def _installed(name: str, who: str, instead: str) -> VerticalDatum:
                 return VerticalDatum(name, GeoidRaster.open(folder / grid), CRS.from_epsg(known.epsg))
     raise ConfigError(
         f"{who} needs PROJ's grid {known.grids[0]}, which is not in {', '.join(map(str, folders))}. Get it with "
-        f"`pyproj sync --file {known.grids[0]}` or the package proj-data, or give a geoid raster with {instead}."
+        f"`pyproj sync --file {known.grids[0]}` or the package proj-data {known.packages}, or give a geoid raster with "
+        f"{instead}."
     )
 
 

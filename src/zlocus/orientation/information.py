@@ -115,12 +115,17 @@ class SparseInformation:
     def covariance(self, sigma: float, variance: FloatArray) -> SparseCovariance:
         """See `Information`."""
         k = self.ahead.shape[1]
-        factored = BlockTridiagonal.of(self.normal / sigma**2 + sparse.diags_array(1.0 / variance))
+        factored = BlockTridiagonal.of(self.normal / sigma**2 + diagonal_matrix(1.0 / variance))
         outer = np.column_stack([self.ahead, self.lost])
         none, one = np.zeros((k, k)), np.eye(k)
         inverse_of_middle = np.block([[none, -one], [-one, -(self.back.T @ self.lost)]]) * sigma**2
         solved = factored.solve(outer)
         return SparseCovariance(factored, solved, inverse_of_middle + outer.T @ solved)
+
+
+def diagonal_matrix(values: FloatArray) -> Any:
+    """Sparse matrix (p, p) with these values (p,) on its diagonal; `sparse.diags_array` is not in every SciPy."""
+    return sparse.dia_array((values[None], [0]), shape=(len(values), len(values)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +170,7 @@ def weak_directions(normal: Any, scale: FloatArray, n_views: int) -> WeakDirecti
     if isinstance(normal, np.ndarray):
         _, vectors = linalg.eigh(normal * inverse[:, None] * inverse, subset_by_value=(-np.inf, limit))
         return WeakDirections(scale[:, None] * vectors, inverse[:, None] * vectors, vectors.shape[1])
-    of_linked = sparse.diags_array(inverse[linked])
+    of_linked = diagonal_matrix(inverse[linked])
     scaled = of_linked @ normal.tocsr()[linked][:, linked] @ of_linked
     found = smallest_eigenvectors(scaled, limit)
     vectors = np.zeros((len(scale), found.shape[1]))
@@ -181,7 +186,7 @@ def smallest_eigenvectors(matrix: Any, limit: float) -> FloatArray:
     until it has eigenvalues above the limit. Where it does not converge the matrix is taken as dense.
     """
     size = matrix.shape[0]
-    factored = BlockTridiagonal.of(matrix + limit * sparse.eye_array(size))
+    factored = BlockTridiagonal.of(matrix + diagonal_matrix(np.full(size, limit)))
     n_directions = FIRST_DIRECTIONS
     while n_directions < size // 4:
         basis, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((size, n_directions)))

@@ -31,6 +31,7 @@ from zlocus.orientation.information import (
     DenseInformation,
     Information,
     WeakDirections,
+    diagonal_matrix,
     weak_directions,
 )
 from zlocus.orientation.parameter_groups import ParameterGroup, corrected_sensors
@@ -387,7 +388,7 @@ def reduced(
     pull_of_points = summed(by_points, point, n)
     if ground_information is not None:
         pull_of_points = pull_of_points + np.where(fixed[:, None], ground_information.pull, 0.0)
-    weighted = sparse.diags_array(np.repeat(used, 2)) @ linearised.by_parameters
+    weighted = diagonal_matrix(np.repeat(used, 2)) @ linearised.by_parameters
     mixed = weighted.T @ spread(linearised.by_ground, point, n)
     eliminated = mixed @ sparse.bsr_array((covariance, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
     normal = linearised.by_parameters.T @ weighted - eliminated @ mixed.T

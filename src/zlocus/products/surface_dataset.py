@@ -46,8 +46,7 @@ def check_xarray() -> None:
             import_module(name)
     except ImportError as error:
         raise InputError(
-            f"{error.name} is not installed. Install it with pip, or all that is needed with `pip install '.[xarray]'` "
-            "in the clone of zlocus."
+            f"{error.name} is not installed. Install what is needed with `pip install xarray rioxarray`."
         ) from error
 
 

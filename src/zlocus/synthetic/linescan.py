@@ -99,7 +99,7 @@ def sampled_trajectory(camera: LineScanner, n_rows: int, samples_per_s: float = 
     start, end = interval * (n_rows + MARGIN_PX), -interval * MARGIN_PX
     times = np.arange(np.floor(start * samples_per_s), np.ceil(end * samples_per_s) + 1) / samples_per_s
     centres, frame_from_camera = camera.poses(times / interval)
-    return Trajectory(times, centres, np.ascontiguousarray(frame_from_camera.mT))
+    return Trajectory(times, centres, np.ascontiguousarray(frame_from_camera.swapaxes(-1, -2)))
 
 
 def with_noise(trajectory: Trajectory, noise: TrajectoryNoise, rng: np.random.Generator) -> Trajectory:

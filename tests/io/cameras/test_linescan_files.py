@@ -144,7 +144,7 @@ def test_four_ways_to_write_one_flight(folder):
     lon, lat, h, camera = level_flight()
     axes = east_north_up(np.deg2rad(lon), np.deg2rad(lat))
     centres = WGS84_EARTH.cartesian_from_ground(np.column_stack([lon, lat, h]))
-    expected = Trajectory(np.arange(4001.0), centres, np.ascontiguousarray((axes @ camera).mT))
+    expected = Trajectory(np.arange(4001.0), centres, np.ascontiguousarray((axes @ camera).swapaxes(-1, -2)))
     x, y = Transformer.from_crs(WGS84, UTM, always_xy=True).transform(lon, lat)
     # Grid north lies (lon - 9) sin(lat) east of north, to the first order (3rd: 1e-6 of it).
     convergence = np.rad2deg(np.arctan(np.tan(np.deg2rad(lon - 9.0)) * np.sin(np.deg2rad(lat))))

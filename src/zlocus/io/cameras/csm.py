@@ -246,7 +246,7 @@ def _sampled(state: CsmState, lines: LineTimes, toward: FloatArray, line: FocalL
 
 def _poses(state: CsmState, times: FloatArray, toward: FloatArray) -> Trajectory:
     geocentric_from_camera = _rotations(state, times) * toward
-    return Trajectory(times, _positions(state, times), np.ascontiguousarray(geocentric_from_camera.mT))
+    return Trajectory(times, _positions(state, times), np.ascontiguousarray(geocentric_from_camera.swapaxes(-1, -2)))
 
 
 def _rotations(state: CsmState, times: FloatArray) -> FloatArray:

@@ -130,9 +130,8 @@ def read_trajectory(
     from scipy.spatial.transform import Rotation
 
     camera = Rotation.from_euler("XYZ", boresight_deg, degrees=True).as_matrix()
-    return Trajectory(
-        table.columns["time"] + 0.0, places + platform @ lever_arm, np.ascontiguousarray((platform @ camera).mT)
-    )
+    camera_from_earth = np.ascontiguousarray((platform @ camera).swapaxes(-1, -2))
+    return Trajectory(table.columns["time"] + 0.0, places + platform @ lever_arm, camera_from_earth)
 
 
 def write_calibration(path: Path, lines: dict[str, FocalLine], comment: str, every: int = 1) -> None:
@@ -154,7 +153,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternio
     from scipy.spatial.transform import Rotation
 
     turn: tuple[str, ...] = OMEGA_PHI_KAPPA
-    rotations = Rotation.from_matrix(trajectory.rotations.mT)
+    rotations = Rotation.from_matrix(trajectory.rotations.swapaxes(-1, -2))
     if quaternions:
         turn, turns = QUATERNION, rotations.as_quat()
     else:
@@ -249,7 +248,7 @@ def _on_earth(
             raise InputError(f"The {table.what} {table.path} has quaternions, which need a geocentric crs: EPSG:4978.")
         return places, np.broadcast_to(np.eye(3), (len(table), 3, 3))
     if crs.is_projected:
-        return places, WGS84_EARTH.poses(crs, given)[1].mT
+        return places, WGS84_EARTH.poses(crs, given)[1].swapaxes(-1, -2)
     lon, lat, _ = WGS84_EARTH.geographic_from_cartesian(places).T
     return places, east_north_up(np.deg2rad(lon), np.deg2rad(lat))
 

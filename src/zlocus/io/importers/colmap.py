@@ -99,7 +99,7 @@ def _exposure(
     # SciPy's rotations cost 0.2 s to import, and other importers do without them.
     from scipy.spatial.transform import Rotation
 
-    rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
+    rotation = Rotation.from_quat(pose[[1, 2, 3, 0]]).as_matrix()  # COLMAP has the scalar first, SciPy last
     known = cameras[camera]
     return ImportedExposure(name, known.interior, -rotation.T @ pose[4:], rotation, known.size)
 

@@ -167,7 +167,7 @@ def _client(address: str) -> Any:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ConfigError("--scheduler needs distributed, which is not installed: pip install '.[cluster]'.") from error
+        raise ConfigError("--scheduler needs distributed, which is not installed: pip install distributed.") from error
     try:
         return Client(address, timeout=CONNECT_S)
     except (OSError, ValueError) as error:  # timeouts are among the first
