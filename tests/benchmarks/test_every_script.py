@@ -61,6 +61,7 @@ RUN_BY = {
     "peers/running.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
     "peers/scenes.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
     "peers/sgm_speed.py": "test_peers_command.py::test_aggregation_is_timed_beside_other_programs",
+    "processors.py": "test_processors.py::test_libraries_for_other_processors_make_the_same_bytes",
     "precision.py": "test_surfaces.py::test_standard_deviations_are_calibrated",
     "rows/standard_deviations.py": "test_surfaces.py::test_shares_within_sigma_by_recipe",
     "recording.py": "test_result_files.py::test_the_tables_that_a_script_prints_are_kept",

@@ -36,10 +36,11 @@ from zlocus.inspector.folder import Patch, read_patch, surface_folder
 from zlocus.inspector.guard import inline_hashes
 from zlocus.inspector.inspection import MADE_AGAIN, NOT_THE_SAME, Inspection
 from zlocus.inspector.queries import BadQuery, number, once, what_if, whole
-from zlocus.inspector.restored_run import folder_of, request_of, restored
+from zlocus.inspector.restored_run import restored
 from zlocus.inspector.server import page_files
 from zlocus.inspector.serving import checked_address, fragment_of, listening
 from zlocus.matching.point_match import curves_at
+from zlocus.pipeline.recorded_run import folder_of, request_of
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.point_report import PointReport, point_record
 from zlocus.products.report.maps import FLAG_GROUPS, groups_of
@@ -412,7 +413,7 @@ def test_what_is_no_surface_is_refused_with_a_sentence(out, tmp_path):
     record = json.loads((copy / "run.json").read_text())
     record["config"]["request"]["inputs"] = 7
     with pytest.raises(InputError, match="does not hold the request of the run"):
-        request_of(copy, record)
+        request_of(copy / "run.json", record)
     (copy / "views.tif").unlink()
     with pytest.raises(InputError, match=r"views\.tif"):
         Inspection(copy)

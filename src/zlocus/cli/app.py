@@ -32,6 +32,7 @@ from zlocus.cli.paper import PaperOptions, paper
 from zlocus.cli.products import ProductsOptions, products
 from zlocus.cli.rank import RankOptions, rank
 from zlocus.cli.report import ReportOptions, report
+from zlocus.cli.rerun import RerunOptions, rerun
 from zlocus.cli.tiles import tiles
 from zlocus.core.signals import handle_signals
 from zlocus.core.startup import prepare
@@ -42,6 +43,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("dsm", DsmOptions, dsm),
     ("products", ProductsOptions, products),
     ("cloud", CloudOptions, cloud),
+    ("rerun", RerunOptions, rerun),
     ("curves", CurvesOptions, curves),
     ("paper", PaperOptions, paper),
     ("orient", OrientOptions, orient),

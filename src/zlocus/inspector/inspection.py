@@ -22,8 +22,9 @@ from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
 from zlocus.inspector.queries import KINDS, MAX_VALUES, WINDOWS
 from zlocus.inspector.reference import Reference, check_comparison, reference_for
-from zlocus.inspector.restored_run import Restored, config_of, restored
+from zlocus.inspector.restored_run import Restored, restored
 from zlocus.io.run_record import read_record
+from zlocus.pipeline.recorded_run import config_of
 from zlocus.pipeline.report_inputs import said
 from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.report.page import KIND_WORDS
@@ -204,7 +205,7 @@ class Inspection:
         """What the page needs before it can show anything."""
         folder, run = self.folder, self.folder.run
         try:
-            config = config_of(folder.out, run)
+            config = config_of(folder.out / RECORD, run)
         except ConfigError:
             config = RunConfig()  # The opening of the scene fails then, with the reason.
         rows, cols = folder.shape

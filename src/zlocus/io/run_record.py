@@ -108,6 +108,28 @@ def result_record(
     }
 
 
+def origin_record(command: str, kernels: str) -> dict[str, Any]:
+    """By which command, when, where and on what kind of processor a result was made, for run.json.
+
+    kernels : digest of the sources of the compiled kernels.
+    """
+    return {
+        "command": command,
+        "created": utc_now(),
+        "started_in": str(Path.cwd()),
+        "processor": processor_name(),
+        "kernels": kernels,
+    }
+
+
+def processor_name() -> str:
+    """Kind of processor that kernels are compiled for, as LLVM names it, such as `znver4` or `skylake-avx512`."""
+    from llvmlite.binding import get_host_cpu_name
+    from numba import config
+
+    return str(config.CPU_NAME or get_host_cpu_name())  # type: ignore[attr-defined]
+
+
 def utc_now() -> str:
     """The current time in UTC, as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -24,7 +24,7 @@ from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import CloudRequest, check_output
-from zlocus.io.run_record import Stopwatch, read_record, result_record, write_record
+from zlocus.io.run_record import Stopwatch, origin_record, read_record, result_record, write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.image_space import depth_options, is_by_depth
 from zlocus.matching.quality import Quality
@@ -33,8 +33,8 @@ from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.plan import keep_at_most
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
-from zlocus.pipeline.fingerprint import digest_of_images
-from zlocus.pipeline.finished_record import is_map_of_image, read_finished, write_finished
+from zlocus.pipeline.fingerprint import COMMANDS, digest_of_images, kernels_of_package
+from zlocus.pipeline.finished_record import checksum, is_map_of_image, read_finished, write_finished
 from zlocus.pipeline.finished_run import files_gone
 from zlocus.pipeline.image_scenes import (
     GroundArea,
@@ -194,6 +194,9 @@ def _made(
         shortcoming = shortcoming_of(out / CLOUD_FILES[0], coverage, prepared_cloud.setup)
         record = {
             **result_record(request, prepared_cloud.config, checksums, stopwatch),
+            **origin_record(COMMANDS[CloudRequest], kernels_of_package()),
+            "given_options": checkpoint.key["options"],
+            "rasters": {name: checksum(out / name) for name in names if is_map_of_image(name)},
             "orientation": orientation.as_dict(),
             "vertical": vertical_datum.as_dict(),
             "images": {name: image_record(m) for name, m in zip(prepared_cloud.references, matched, strict=True)},

@@ -46,11 +46,16 @@ def key_of(request: DsmRequest | CloudRequest, config: RunConfig, inputs: InputF
     return {
         "command": COMMANDS[type(request)],
         "versions": versions_record(),
-        "kernels": kernels_digest(Path(zlocus.__file__).parent),
+        "kernels": kernels_of_package(),
         "request": {name: str(value) if isinstance(value, Path) else value for name, value in asked.items()},
         "options": config_as_dict(config),
         "inputs": dict(inputs.states),
     }
+
+
+def kernels_of_package() -> str:
+    """Digest of the sources of all compiled kernels."""
+    return kernels_digest(Path(zlocus.__file__).parent)
 
 
 def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:

@@ -16,10 +16,12 @@ from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import Scene
 from zlocus.io.config import config_as_dict
 from zlocus.io.input_files import InputFiles
-from zlocus.io.run_record import Stopwatch, request_as_dict, utc_now, versions_record, write_record
+from zlocus.io.run_record import Stopwatch, origin_record, request_as_dict, versions_record, write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.orientation.plausibility import Doubt
+from zlocus.pipeline.fingerprint import COMMANDS, kernels_of_package
+from zlocus.pipeline.finished_record import checksum
 from zlocus.pipeline.messages import grave_doubt
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup
@@ -32,6 +34,7 @@ from zlocus.products.tie_observations import write_observations
 
 # A surface with heights for a smaller share of the cells seen by two images is no success.
 SUFFICIENT_COVERAGE = 0.5
+RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
 
 
 def has_colours(request: DsmRequest, setup: RunSetup) -> bool:
@@ -122,7 +125,10 @@ def run_record(
     tally: Tally,
     plan: Plan,
 ) -> dict[str, Any]:
-    """The content of run.json, except the stages. inputs : path and checksum of each file."""
+    """The content of run.json, except the stages. inputs : path and checksum of each file.
+
+    Of the rasters it has the checksums, by which `zlocus rerun` tells whether another run made the same bytes.
+    """
     return {
         **_request_record(request, config, setup.scene, inputs),
         "orientation": setup.orientation.as_dict(),
@@ -131,6 +137,7 @@ def run_record(
         "heights": heights_record(setup),
         **tally.as_dict(),
         "plan": plan.as_dict(),
+        "rasters": {name: checksum(request.out / name) for name in RASTERS},
     }
 
 
@@ -140,8 +147,7 @@ def _request_record(
     """Request, options, time, versions, input files, and when the images were taken."""
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
-        "created": utc_now(),
-        "started_in": str(Path.cwd()),
+        **origin_record(COMMANDS[DsmRequest], kernels_of_package()),
         "versions": versions_record(),
         "inputs": list(inputs),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
