@@ -23,8 +23,8 @@ def zl():
 
 
 def test_a_plan_has_the_options_of_a_surface():
-    """All but who does the work, which is said task by task."""
-    shared = [f.name for f in fields(DsmOptions) if f.name not in ("inputs", "out", "workers", "scheduler")]
+    """All but who does the work, which is said task by task, and --dry-run, which a plan does not need."""
+    shared = [f.name for f in fields(DsmOptions) if f.name not in ("inputs", "out", "workers", "scheduler", "dry_run")]
     assert [f.name for f in fields(TilesPlanOptions)] == ["out", "inputs", "tasks", *shared]
     assert {f.name: f.default for f in fields(TilesPlanOptions)}["maps"] == "hillshade"
     with pytest.raises(TypeError):

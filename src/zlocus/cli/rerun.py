@@ -48,4 +48,5 @@ def rerun(options: RerunOptions, console: Console) -> Answer:
     )  # fmt: skip
     from zlocus.pipeline.rerun import run_again
 
-    return Answer(run_again(request, console.progress), {"record": str(options.record)})
+    result = run_again(request, console.progress)
+    return Answer(str(result), {"coverage": result.coverage, "was_finished": result.was_finished})

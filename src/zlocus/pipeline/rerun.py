@@ -135,7 +135,7 @@ def recorded_request(
     else:
         others |= {"workers": request.workers or 1}
     run = {**run, "config": {**run["config"], "request": places.with_inputs_read(run["config"]["request"])}}
-    again: DsmRequest | CloudRequest = request_with(path, run, kind, places.of, others)
+    again = request_with(path, run, kind, places.of, others)
     if unplaced:
         places.check_opened(unplaced, again)
     return again
