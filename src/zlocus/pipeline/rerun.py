@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from zlocus.core.errors import CoverageError, InputError
 from zlocus.core.progress import Progress, SilentProgress
@@ -138,7 +138,7 @@ def recorded_request(
     again = request_with(path, run, kind, places.of, others)
     if unplaced:
         places.check_opened(unplaced, again)
-    return again
+    return cast(DsmRequest | CloudRequest, again)
 
 
 def _check_inputs_recorded(path: Path, run: Mapping[str, Any]) -> None:
