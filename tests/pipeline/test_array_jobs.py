@@ -426,10 +426,11 @@ def test_damaged_plans_are_made_again(zl, images, straight, out, tmp_path):
     (out / FOLDER / VALUES).write_bytes(b"nothing")
     assert "plan.bin is missing or damaged" in sentence_of(zl("tiles", "run", out, 2), 2)
     assert "Done: 1 of 3 tasks" in zl(*asked(images, out, tmp_path)).stdout
+    assert zl("tiles", "run", out, 2).exit_code == 0
     (out / FOLDER / PLAN).write_text("{")
     assert "and no plan of tasks" in sentence_of(zl("tiles", "run", out, 2), 2)
-    assert "Done: 1 of 3 tasks" in zl(*asked(images, out, tmp_path)).stdout
-    assert [zl("tiles", "run", out, number).exit_code for number in (2, 3)] == [0, 0]
+    assert "Done: 2 of 3 tasks" in zl(*asked(images, out, tmp_path)).stdout
+    assert zl("tiles", "run", out, 3).exit_code == 0
     assert zl("tiles", "assemble", out).exit_code == 0
     check_same_files(out, straight)
 

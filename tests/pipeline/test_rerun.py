@@ -98,8 +98,13 @@ def test_a_cloud_is_made_again_with_the_same_bytes(zl, folder):
     assert "All 2 rasters have the recorded bytes." in done.stdout
     for name in ("fore_height.tif", "fore_quality.tif", "cloud.ply"):
         assert (folder / "cloud" / name).read_bytes() == (folder / "again" / name).read_bytes(), name
-    assert record_of(folder / "cloud")["given_options"]["pyramid"]["tile"] == 80
     assert "already finished" in zl(*words, "-o", "again").stdout
+    # The options that count are those that were given, not as they were adapted to the images.
+    record = record_of(folder / "cloud")
+    assert record["given_options"]["pyramid"]["tile"] == 80
+    record["config"]["options"]["pyramid"]["tile"] = 4096
+    Path("run.json").write_text(json.dumps(record))
+    assert "already finished" in zl("rerun", "run.json", "-o", "again").stdout
 
 
 def test_records_of_earlier_runs_are_read(zl, folder):
@@ -135,6 +140,15 @@ def test_inputs_are_found_where_they_were_and_where_they_are(zl, folder, tmp_pat
     assert done.exit_code == 0, done.output
     assert "All 5 rasters have the recorded bytes." in done.stdout
     assert "is no folder" in sentence_of(zl("rerun", "run.json", "-o", "other", "--inputs", "gone"))
+    shutil.copy("run.json", "archive")
+    assert zl("rerun", "archive/run.json", "-o", "beside").exit_code == 0, "the images lie beside the record"
+    # From another machine, where they had other paths.
+    text = Path("run.json").read_text()
+    for name in ("nadir", "fore", "aft"):
+        text = text.replace(f'"{name}.tif"', f'"/mission/images/{name}.tif"')
+    Path("run.json").write_text(text)
+    assert "/mission/images/nadir.tif" in sentence_of(zl("rerun", "run.json", "-o", "other"))
+    assert zl("rerun", "run.json", "-o", "other", "--inputs", "archive").exit_code == 0
 
 
 def test_an_input_with_another_content_is_refused(zl, folder):
@@ -173,6 +187,24 @@ def test_images_of_a_scene_file_and_a_geoid_are_checked(zl, folder, tmp_path, mo
     assert "geoid.tif has changed since" in sentence_of(zl("rerun", "surface", "-o", "b", "--inputs", "elsewhere"))
     (project / "images" / "aft.tif").write_bytes(b"II*\0 other")
     assert "aft.tif has changed since" in sentence_of(zl("rerun", "surface", "-o", "b", "--inputs", "elsewhere"))
+
+
+def test_files_that_the_request_does_not_name_are_checked_where_they_are_opened(zl, folder):
+    """As the grid of a geoid in the folder of PROJ, which has another place on each machine."""
+    lines = [f"  - {{name: {n}, image: {n}.tif, camera: {{kind: rpc}}}}" for n in ("nadir", "fore", "aft")]
+    Path("scene.yaml").write_text("\n".join(["schema: 1", "views:", *lines]) + "\n")
+    assert zl("dsm", "scene.yaml", "-o", "surface", "--heights", 25, 80, "--no-report").exit_code == 0
+    record = record_of(folder / "surface")
+    (entry,) = (each for each in record["inputs"] if Path(each["path"]).name == "aft.tif")
+    entry["path"], digest = "/other/machine/aft.tif", entry["sha256"]
+    Path("run.json").write_text(json.dumps(record))
+    assert zl("rerun", "run.json", "-o", "again").exit_code == 0
+    entry["sha256"] = "0" * 64
+    Path("run.json").write_text(json.dumps(record))
+    assert "aft.tif has changed since" in sentence_of(zl("rerun", "run.json", "-o", "other"))
+    entry["path"], entry["sha256"] = "/other/machine/gone.tif", digest
+    Path("run.json").write_text(json.dumps(record))
+    assert "gone.tif of the run of run.json is not there" in sentence_of(zl("rerun", "run.json", "-o", "other"))
 
 
 def test_an_image_that_was_not_read_is_not_needed(zl, folder):
