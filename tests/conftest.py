@@ -21,7 +21,7 @@ from hypothesis import settings
 TESTS = Path(__file__).parent
 # What `make test-fast` leaves out (marker `slow`): whole runs, pages, and files that take more than some ten seconds.
 SLOW = (
-    "runs", "docs", "benchmarks", "packaging", "pipeline", "inspector", "products/report", "cli",
+    "runs", "docs", "benchmarks", "installation", "pipeline", "inspector", "products/report", "cli",
     "core/test_resources.py", "core/test_signals.py", "core/test_startup.py", "core/test_startup_imports.py",
     "evaluation/test_evaluate_coarse_references.py", "io/test_io_damaged_files.py", "io/test_open_raster_remote.py",
     "matching/test_fusion.py", "matching/test_true_ortho.py", "orientation/test_parameter_groups.py",

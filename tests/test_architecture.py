@@ -299,7 +299,7 @@ def test_a_planted_second_name_is_seen(tmp_path):
 
 
 # Tests of whole runs, of the documentation, of the benchmarks and of what is installed belong to no single module.
-NOT_MIRRORED = ("runs", "docs", "benchmarks", "packaging")
+NOT_MIRRORED = ("runs", "docs", "benchmarks", "installation")
 # Tests of the whole package, or of several of its modules.
 OF_SEVERAL_MODULES = {"test_architecture.py", "test_kernel_signatures.py", "matching/test_stages_against_twins.py"}
 
