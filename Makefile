@@ -52,7 +52,7 @@ test-minimum: $(STAMP)
 	$(PYTHON) -m venv $(MINIMUM)
 	$(BIN)/python tests/support/lowest_versions.py \
 	    "$$($(MINIMUM)/bin/python -c 'import sys; print(*sys.version_info[:2], sep=".")')" > $(MINIMUM)/versions.txt
-	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[dev]'
+	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[test]'
 	$(MINIMUM)/bin/python -m pytest -n 2 --dist worksteal
 
 # Known vulnerabilities of what is installed, from the package registry.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,10 @@ ALBEDO, GAIN = 0.02, 0.02
 FLOAT32_GREY = 1e-3
 
 
+@pytest.mark.skipif(
+    "rtol" not in signature(cg).parameters,
+    reason="SciPy before 1.12 has conjugate gradients in Fortran: other last bits",
+)
 def test_conjugate_gradients_are_those_of_scipy():
     """To the last bit: from 0 and from elsewhere, with a preconditioner; and for a right side of 0."""
     rng = np.random.default_rng(3)

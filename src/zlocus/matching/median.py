@@ -16,4 +16,5 @@ def median(values: NDArray[np.float32]) -> NDArray[np.float32]:
     ordered = np.partition(values, half, axis=-1)
     if values.shape[-1] % 2:
         return np.asarray(ordered[..., half])
-    return np.asarray((ordered[..., :half].max(axis=-1) + ordered[..., half]) / 2)
+    # The type is named, because NumPy before version 2 makes float64 of a single float32 by a division.
+    return np.asarray((ordered[..., :half].max(axis=-1) + ordered[..., half]) / 2, values.dtype)

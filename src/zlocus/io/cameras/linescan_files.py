@@ -153,7 +153,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, comment: str, quaternio
     from scipy.spatial.transform import Rotation
 
     turn: tuple[str, ...] = OMEGA_PHI_KAPPA
-    rotations = Rotation.from_matrix(trajectory.rotations.swapaxes(-1, -2))
+    rotations = Rotation.from_matrix(trajectory.rotations.swapaxes(-1, -2).copy())
     if quaternions:
         turn, turns = QUATERNION, rotations.as_quat()
     else:
