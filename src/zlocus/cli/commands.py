@@ -33,9 +33,8 @@ def command_of(name: str, options: type[Options], run: Command[Options]) -> Call
     def command(**values: Any) -> None:
         of_output = OutputOptions(**{field.name: values.pop(field.name) for field in fields(OutputOptions)})
         given = {"out": str(values["out"])} if values.get("out") is not None else {}
-        console = explained(Console, Console(name, OutputOptions(as_json=of_output.as_json), given))(
-            name, of_output, given
-        )
+        plain_console = Console(name, OutputOptions(as_json=of_output.as_json), given)  # says what is wrong with others
+        console = explained(Console, plain_console)(name, of_output, given)
 
         def answered() -> None:
             answer = run(options(**values), console)

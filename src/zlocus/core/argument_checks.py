@@ -70,11 +70,7 @@ def number_or_none(name: str, value: Any) -> float | None:
     ConfigError
         It is neither.
     """
-    if value is None:
-        return None
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        raise ConfigError(f"{name} is {kind_of(value)}. Give a number.")
-    return float(value)
+    return None if value is None else float(_scalar(name, value, Real, "number"))
 
 
 def count_or_none(name: str, value: Any) -> int | None:
@@ -85,11 +81,25 @@ def count_or_none(name: str, value: Any) -> int | None:
     ConfigError
         It is neither.
     """
-    if value is None:
-        return None
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
-        raise ConfigError(f"{name} is {kind_of(value)}. Give a whole number.")
-    return int(value)
+    return None if value is None else whole_number(name, value)
+
+
+def whole_number(name: str, value: Any) -> int:
+    """An argument that is a whole number.
+
+    Raises
+    ------
+    ConfigError
+        It is none.
+    """
+    return int(_scalar(name, value, Integral, "whole number"))
+
+
+def _scalar(name: str, value: Any, kind: type[Any], noun: str) -> Any:
+    """A value of a kind of numbers, to which truth values do not belong. noun : what to give."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
+        raise ConfigError(f"{name} is {kind_of(value)}. Give a {noun}.")
+    return value
 
 
 def bounds_or_none(value: Any) -> tuple[float, float, float, float] | None:
@@ -143,9 +153,7 @@ def text_or_none(name: str, value: Any) -> str | None:
     ConfigError
         It is neither.
     """
-    if value is None:
-        return None
-    return text_of(name, value)
+    return None if value is None else text_of(name, value)
 
 
 def text_of(name: str, value: Any) -> str:

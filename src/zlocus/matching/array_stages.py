@@ -18,10 +18,10 @@ from zlocus.core.argument_checks import (
     bounds_or_none,
     count_or_none,
     instance_of,
-    kind_of,
     numeric_array,
     positions,
     positive_number,
+    whole_number,
 )
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import PyramidOptions, SemiGlobalOptions
@@ -143,7 +143,7 @@ def ncc_cost(grey: NDArray[np.floating], *, window: int = 5, reference: int | No
     grey = numeric_array("grey", grey, "images, heights, rows, columns")
     if len(grey) < 2 or min(grey.shape) < 1:
         raise ConfigError(f"The images are {grey.shape}. Give (images, heights, rows, columns) of two images or more.")
-    window, reference = _whole("window", window), count_or_none("reference", reference)
+    window, reference = whole_number("window", window), count_or_none("reference", reference)
     if window < 3 or window % 2 == 0 or (reference is not None and not 0 <= reference < len(grey)):
         raise ConfigError(
             f"A window of {window} and reference {reference} do not fit {len(grey)} images. Give an odd window of 3 or "
@@ -247,13 +247,6 @@ def _check_even(x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
         )
 
 
-def _whole(name: str, value: int) -> int:
-    number = count_or_none(name, value)
-    if number is None:
-        raise ConfigError(f"{name} is {kind_of(value)}. Give a whole number.")
-    return number
-
-
 def semiglobal(
     cost: NDArray[np.floating],
     *,
@@ -285,7 +278,7 @@ def semiglobal(
             raise ConfigError(f"The ortho-image has {ortho.shape} cells, the cost {shape}. Give both on one grid.")
     advice = "Give zlocus.SemiGlobalOptions(...)."
     options = SemiGlobalOptions() if options is None else instance_of("options", options, SemiGlobalOptions, advice)
-    step_cells, n_images = positive_number("step_cells", step_cells, "cells"), _whole("n_images", n_images)
+    step_cells, n_images = positive_number("step_cells", step_cells, "cells"), whole_number("n_images", n_images)
     if n_images < PAIR:
         raise ConfigError(f"n_images is {n_images}, and a cost compares {PAIR} or more. Give their number.")
     counted = np.rint(np.where(np.isfinite(cost), cost, 1.0) * COST_UNIT).clip(0, MAX_COST).astype(np.uint8)

@@ -34,7 +34,7 @@ NEEDED = ("config", "versions", "grid", "vertical", "coverage")
 
 
 def check_xarray() -> None:
-    """Refuse to go on where xarray or rioxarray is not installed.
+    """Raise an error where xarray or rioxarray is not installed.
 
     Raises
     ------

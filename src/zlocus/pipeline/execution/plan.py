@@ -84,9 +84,9 @@ def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig
     """Estimate what tiles need, from the cells, views and pixels of a sample of them."""
     worked = [tile for tile in tiles if tile.core_window.rows and tile.core_window.cols]
     most, seconds, looked = 0, 0.0, worked[:: -(-len(worked) // MAX_SAMPLED_TILES) or 1]
-    # With one level all heights are searched on the finest cells, with more only those near the next coarser surface.
-    most_steps = STEPS_PER_CELL if match_scene.levels > 1 else match_scene.n_steps + 16
-    steps = min(most_steps, match_scene.n_steps + 16)
+    steps = match_scene.n_steps + 16
+    if match_scene.levels > 1:  # the finest cells search near the next coarser surface only
+        steps = min(steps, STEPS_PER_CELL)
     for tile in looked:
         fine = level_window(
             tile.core_window, 0, config.pyramid.halo, config.pyramid.block, match_scene.overlap_window
