@@ -163,6 +163,8 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "ZlocusError": ("error",),
     # The classes of one protocol have its noun.
     "CameraEntry": ("camera", "entry"),
+    "DeliveredImage": ("image",),
+    "DeliveredView": ("view",),
     "DepthRays": ("rays",),
     "FrameCamera": ("camera",),
     "FrameModel": ("sensor",),
@@ -174,7 +176,9 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "LineScanModel": ("sensor",),
     "LineScanner": ("camera",),
     "OpenedCamera": ("camera",),
+    "PlacedTile": ("tile",),
     "RasterImage": ("image",),
+    "ResolvedEntry": ("entry",),
     "RectifiedScanner": ("camera",),
     "SensorModel": ("sensor",),
     # The noun is in the middle of the class's name, or the class is one of several kinds of it.

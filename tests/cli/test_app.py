@@ -146,7 +146,6 @@ def test_dsm_reads_its_configuration(zl, pipeline, tmp_path):
     [
         (["a.tif"], "There is no file a.tif"),
         ([__file__], "two images or more"),
-        (["."], ". is a folder. It holds no image"),
         (["a.tif", "?.tif"], "No file matches ?.tif"),
         (["a.tif", "a.tif"], "given twice"),
         (["a.tif", "scene.yaml"], "must be the only input"),

@@ -14,7 +14,8 @@ from places import SUPPORT
 from rendered_scenes import PART, SMALL_TILES, read, run
 from zlocus.core.errors import InputError
 from zlocus.io.images import open_image
-from zlocus.io.open_raster import gdal_name, is_remote
+from zlocus.io.open_raster import gdal_name
+from zlocus.io.stored_files import is_remote
 
 
 @pytest.fixture

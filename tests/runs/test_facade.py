@@ -15,7 +15,8 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.requests import ImportRequest
-from zlocus.io.scene_file import open_scene, rotation_to_axes
+from zlocus.io.local_axes import rotation_to_axes
+from zlocus.io.scene_file import open_scene
 from zlocus.orientation.orientation import OrientationRequest, orient
 from zlocus.synthetic.terrain import analytic_height
 

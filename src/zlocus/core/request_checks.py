@@ -8,19 +8,22 @@ from pathlib import Path
 
 from zlocus.core.errors import ConfigError, InputError
 
-# Suffixes of images that are looked for in a folder, for the message that refuses it.
+# Suffixes of the images that are looked for in a folder.
 IMAGE_SUFFIXES = (".tif", ".tiff", ".ntf", ".jp2", ".jpg", ".jpeg", ".png", ".img", ".vrt")
+# Ends of the names of files that hold or name several images, and of GDAL's names for what is in an archive.
+CONTAINERS = (".zip", ".tar", ".tgz", ".tar.gz", ".json", ".geojson")
+ARCHIVE_SYSTEMS = ("/vsizip/", "/vsitar/")
 SCENE_SUFFIXES = (".yaml", ".yml")
 # Names of vertical datums; the file of a geoid raster may be given instead.
 VERTICALS = ("ellipsoid", "egm96", "egm2008")
 
 
 def check_inputs(inputs: tuple[Path, ...]) -> None:
-    """Refuse inputs that are neither two images or more, each once, nor one scene file."""
-    if len(inputs) == 1 and is_scene_file(inputs[0]):
+    """Refuse inputs that are neither two images or more, each once, nor one scene file, nor deliveries."""
+    if len(inputs) == 1 and (is_scene_file(inputs[0]) or _may_hold_images(inputs[0])):
         return
     for path in inputs:
-        _check_names_one_file(path)
+        _check_wildcard(path)
     scene_files = [path for path in inputs if is_scene_file(path)]
     if scene_files:
         raise InputError(f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs.")
@@ -28,7 +31,10 @@ def check_inputs(inputs: tuple[Path, ...]) -> None:
         given = f"only {inputs[0]} is given" if inputs else "none is given"
         if inputs and not (inputs[0].exists() or str(inputs[0]).startswith("/vsi")):
             raise InputError(f"There is no file {inputs[0]}. Check the path.")
-        raise InputError(f"A surface needs two images or more, and {given}. Add images, or give one scene.yaml.")
+        raise InputError(
+            f"A surface needs two images or more, and {given}. Add images, or give a scene.yaml, or the folder that a "
+            "vendor delivered."
+        )
     seen = set()
     for path in inputs:
         if path.resolve() in seen:
@@ -36,15 +42,14 @@ def check_inputs(inputs: tuple[Path, ...]) -> None:
         seen.add(path.resolve())
 
 
-def _check_names_one_file(path: Path) -> None:
-    """Refuse a folder, and a wildcard that reached the program."""
-    if str(path).startswith("/vsi"):  # on a server
-        return
-    if path.is_dir():
-        found = sorted(each for each in path.iterdir() if each.suffix.lower() in IMAGE_SUFFIXES)
-        advice = f"Give the images in it, such as {path}/*{found[0].suffix}" if found else "It holds no image"
-        raise InputError(f"{path} is a folder. {advice}, or give a scene.yaml that names the images.")
-    if any(sign in str(path) for sign in "*?[") and not path.exists():
+def _may_hold_images(path: Path) -> bool:
+    """Whether one input may be enough: a folder, an archive or a file of STAC."""
+    return path.is_dir() or path.name.lower().endswith(CONTAINERS) or str(path).startswith(ARCHIVE_SYSTEMS)
+
+
+def _check_wildcard(path: Path) -> None:
+    """Refuse a wildcard that reached the program."""
+    if not str(path).startswith("/vsi") and any(sign in str(path) for sign in "*?[") and not path.exists():
         matched = len(glob.glob(str(path)))
         raise InputError(
             f"{path} holds a wildcard that the shell did not replace by names ({matched} files match). Leave out the "

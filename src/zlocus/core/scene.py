@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import date as Date
+from datetime import datetime as DateTime
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -155,11 +156,41 @@ class SunDirection:
 
 
 @dataclass(frozen=True)
+class Acquisition:
+    """When and how an image was taken, as far as it is known.
+
+    date : day of the exposure; time : of its first line, UTC; satellite : and sensor, as the vendor names them;
+    sun_direction : at the exposure; view_azimuth_deg : direction from the ground to the sensor, clockwise from north;
+    incidence_deg : angle between that direction and the vertical on the ground; off_nadir_deg : the same angle at the
+    sensor; cloud_cover : share of the image, 0 to 1, as the vendor estimates it.
+    """
+
+    date: Date | None = None
+    time: DateTime | None = None
+    satellite: str | None = None
+    sun_direction: SunDirection | None = None
+    view_azimuth_deg: float | None = None
+    incidence_deg: float | None = None
+    off_nadir_deg: float | None = None
+    cloud_cover: float | None = None
+
+    def completed_by(self, other: Acquisition) -> Acquisition:
+        """This acquisition, with what it does not know taken from another source. A day of one source and the time of
+        another day of the other do not go together: the time is left out then."""
+        known = {field.name: getattr(self, field.name) for field in fields(self)}
+        whole = Acquisition(**{name: getattr(other, name) if at is None else at for name, at in known.items()})
+        is_of_day = whole.time is None or whole.date is None or whole.time.date() == whole.date
+        return whole if is_of_day else replace(whole, time=None)
+
+
+NOT_KNOWN = Acquisition()
+
+
+@dataclass(frozen=True)
 class View:
     """One image with its sensor model in the frame of the scene.
 
-    camera_files : files beside the image from which the sensor model was read; date, sun_direction : of the exposure,
-    where known.
+    camera_files : files beside the image from which the sensor model was read, and what is known of the exposure.
     """
 
     name: str
@@ -167,8 +198,17 @@ class View:
     image: ImageSource
     sensor: SensorModel
     camera_files: tuple[Path, ...] = ()
-    date: Date | None = None
-    sun_direction: SunDirection | None = None
+    acquisition: Acquisition = NOT_KNOWN
+
+    @property
+    def date(self) -> Date | None:
+        """Day of the exposure, where it is known."""
+        return self.acquisition.date
+
+    @property
+    def sun_direction(self) -> SunDirection | None:
+        """Where the sun stood at the exposure, where it is known."""
+        return self.acquisition.sun_direction
 
     @property
     def files(self) -> tuple[Path, ...]:

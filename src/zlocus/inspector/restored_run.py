@@ -11,7 +11,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.requests import SetupRequest
-from zlocus.io.open_raster import is_remote
+from zlocus.io.stored_files import is_remote
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.recorded_run import config_of, request_of
 from zlocus.pipeline.report_inputs import ReportedRun

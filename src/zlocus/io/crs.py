@@ -11,7 +11,8 @@ from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError, ProjError
 
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, quoted
+from zlocus.core.quoting import quoted
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE
 from zlocus.sensors.earth_frame import WGS84, between
 
 LOCAL = (

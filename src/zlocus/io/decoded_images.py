@@ -16,7 +16,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.windows import Window
 
-from zlocus.io.open_raster import file_state, is_remote
+from zlocus.io.stored_files import file_state, is_remote
 
 # Formats whose decoders begin at the first row.
 WHOLE_DRIVERS = frozenset(("JPEG", "PNG", "WEBP"))

@@ -20,7 +20,8 @@ from rasterio.windows import Window
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, file_crs, raster_crs
 from zlocus.io.height_values import check_unit, is_fill
-from zlocus.io.open_raster import existing_file, first_bytes, is_remote, open_raster
+from zlocus.io.open_raster import existing_file, open_raster
+from zlocus.io.stored_files import first_bytes, is_remote
 from zlocus.io.vertical import (
     ELLIPSOIDAL_DESCRIPTION,
     VerticalDatum,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 import warnings
 from collections.abc import Iterator
@@ -16,18 +15,14 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from zlocus.core.errors import InputError, ZlocusWarning
-from zlocus.core.scene import HeldPixels, ImageWindow, SunDirection
+from zlocus.core.scene import NOT_KNOWN, Acquisition, HeldPixels, ImageWindow
+from zlocus.io.archives import is_archived
+from zlocus.io.colour_image import ColourImage
 from zlocus.io.decoded_images import DECODED, whole_bytes
-from zlocus.io.image_dates import date_of_exposure
-from zlocus.io.image_sun import sun_direction_at_exposure
-from zlocus.io.open_raster import (
-    UNCOMPRESSED_DRIVERS,
-    cached_raster,
-    check_complete,
-    file_state,
-    is_remote,
-    open_raster,
-)
+from zlocus.io.image_acquisition import acquisition_of
+from zlocus.io.open_raster import UNCOMPRESSED_DRIVERS, cached_raster, check_complete, open_raster
+from zlocus.io.stored_files import file_state, is_remote
+from zlocus.io.tiled_products import is_tile_index, named_tiles
 from zlocus.io.usable_pixels import MAX_GREY_VALUE, BorderPlateau, border_plateau, count_too_large_values, drop_pixels
 
 # Source: ITU-R BT.601, luma of red, green, blue.
@@ -57,8 +52,8 @@ class RasterImage:
     bands : 1-based indices of the bands that are read; weights : their weights in the grey value; plateau : pixels of
     one value at the border, which are invalid, see `with_plateau`; held : the parts that a sparse file stores, see
     `SparseSource`; state : size and time of the file when it was opened, see `file_state`; sources : other files from
-    which pixels or mask are read; decoded_bytes : see `DecodedSource`; date : of the exposure, None where the file does
-    not say.
+    which pixels or mask are read; decoded_bytes : see `DecodedSource`; acquisition : what the file says of the
+    exposure; colour_image : another image that gives its colours, None for its own.
     """
 
     path: Path
@@ -73,8 +68,8 @@ class RasterImage:
     state: tuple[int, ...] = field(default=(), compare=False, repr=False)
     sources: tuple[Path, ...] = field(default=(), compare=False, repr=False)
     decoded_bytes: int = field(default=0, compare=False, repr=False)
-    date: datetime.date | None = field(default=None, compare=False, repr=False)
-    sun_direction: SunDirection | None = field(default=None, compare=False, repr=False)
+    acquisition: Acquisition = field(default=NOT_KNOWN, compare=False, repr=False)
+    colour_image: ColourImage | None = None
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """Read the window of rows x cols pixels that starts at (row, col) and lies inside the image.
@@ -97,8 +92,8 @@ class RasterImage:
 
     @property
     def has_colours(self) -> bool:
-        """Whether the file declares red, green and blue bands."""
-        return len(self.bands) == len(LUMINANCE)
+        """Whether the file declares red, green and blue bands, or another image gives them."""
+        return self.colour_image is not None or len(self.bands) == len(LUMINANCE)
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
         """Red, green and blue (3, r, c) float32 of a window, in the file's own numbers.
@@ -109,6 +104,8 @@ class RasterImage:
             The file can no longer be read.
         """
         assert self.has_colours, f"{self.path.name} is grey"
+        if self.colour_image is not None:
+            return self.colour_image.colours(row, col, rows, cols)
         with cached_raster(self.path) as source:
             window = Window(col, row, cols, rows)
             stored = [DECODED.window(source, self.path, band, window) for band in self.bands]
@@ -161,8 +158,10 @@ def open_image(path: Path) -> RasterImage:
     return image
 
 
-def open_header(path: Path) -> RasterImage:
+def open_header(path: Path, colour_image: ColourImage | None = None) -> RasterImage:
     """Open an image without reading any of its pixels: every block lies inside the file.
+
+    colour_image : another image that gives its colours.
 
     Raises
     ------
@@ -191,9 +190,10 @@ def open_header(path: Path) -> RasterImage:
                 f"{path} holds no pixels: it is a sparse file of {image.shape[0]} x {image.shape[1]} px, and none of "
                 "its blocks was ever written. Copy it again from its source, or leave it out."
             )
-        image = replace(image, held=held, state=tuple(state), sources=_sources(source, path))
+        sources = _sources(source, path) + (() if colour_image is None else colour_image.files)
+        image = replace(image, held=held, state=tuple(state), sources=sources, colour_image=colour_image)
         image = replace(image, decoded_bytes=whole_bytes(source, path))
-        return replace(image, date=date_of_exposure(source), sun_direction=sun_direction_at_exposure(source))
+        return replace(image, acquisition=acquisition_of(source))
 
 
 def check_last_block(image: RasterImage) -> None:
@@ -213,6 +213,10 @@ def _sources(source: rasterio.DatasetReader, path: Path) -> tuple[Path, ...]:
 
     Overviews and statistics are not read, and the readers of cameras name their own files.
     """
+    if is_tile_index(path):
+        return tuple(named_tiles(path))
+    if is_archived(path):
+        return ()
     others = [Path(name) for name in source.files if Path(name) != path]
     if source.driver == "VRT" or source.driver in UNCOMPRESSED_DRIVERS:
         return tuple(other for other in others if not other.name.endswith((".ovr", ".aux.xml")))

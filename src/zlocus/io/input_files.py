@@ -9,13 +9,14 @@ from typing import Any
 
 from zlocus.core.errors import StoppedError
 from zlocus.core.scene import Scene
-from zlocus.io.open_raster import file_state
+from zlocus.io.archives import stored_file
 from zlocus.io.run_record import inputs_record
+from zlocus.io.stored_files import file_state
 
 
 def files_of(scene: Scene) -> list[Path]:
-    """All files from which the views of a scene are read."""
-    return [path for view in scene.views for path in view.files]
+    """All files from which the views of a scene are read; of what lies in an archive, the archive."""
+    return [stored_file(path) for view in scene.views for path in view.files]
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class InputFiles:
         known: dict[str, list[int]] = {} if earlier_inputs is None else dict(earlier_inputs.states)
         for view in () if scene is None else scene.views:
             if state := getattr(view.image, "state", ()):
-                known[str(view.path)] = list(state)
+                known[str(stored_file(view.path))] = list(state)
         return cls({str(path): known.get(str(path)) or file_state(path) for path in dict.fromkeys(files)})
 
     def changed(self) -> list[str]:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.open_raster import existing_file
-from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, MAX_MAGNITUDE, decimal, quoted, text_lines
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, MAX_MAGNITUDE, decimal, text_lines
 
 SEPARATORS = (",", ";")
 

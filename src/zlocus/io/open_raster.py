@@ -21,10 +21,13 @@ from rasterio.enums import Interleaving
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.scene import HeldPixels
-from zlocus.io.safe_text import quoted
+from zlocus.io.archives import archive_name, is_archived, is_folder_in_archive, stored_file
+from zlocus.io.stored_files import byte_length, file_exists, first_bytes, is_remote
 from zlocus.io.tiff_blocks import held_in_blocks
-from zlocus.io.virtual_rasters import ARCHIVES, FIRST_BYTES, REMOTE, check_served, check_virtual, is_virtual
+from zlocus.io.tiled_products import TileHeader, is_tile_index, tile_layout
+from zlocus.io.virtual_rasters import ARCHIVES, REMOTE, check_served, check_virtual, is_virtual
 
 BLOCK_CACHE_BYTES = 128 << 20
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -35,7 +38,10 @@ LARGE_BLOCK_BYTES, MAX_COMPRESSION_RATIO = 256 << 20, 10_000
 # Bytes of pixel types that NumPy does not have.
 PIXEL_BYTES = {"complex_int16": 4}
 MAX_OPEN_RASTERS = 32  # per thread
-_GDAL = {"GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
+# Beside a compressed archive GDAL would write its unpacked size, into a folder that is not ours.
+_GDAL = {
+    "GDAL_CACHEMAX": BLOCK_CACHE_BYTES, "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE", "CPL_VSIL_GZIP_WRITE_PROPERTIES": "NO",
+}  # fmt: skip
 # Drivers of rasters that refer to other files or to services. They are not used, whatever a file is called; VRT is used
 # for files whose name ends in .vrt.
 INDIRECT_DRIVERS = frozenset((
@@ -50,36 +56,37 @@ UNCOMPRESSED_DRIVERS = frozenset(
 _warnings_lock = threading.Lock()
 
 
-def is_remote(path: Path) -> bool:
-    """Whether a path is in one of GDAL's virtual file systems: `/vsicurl/` and an address, `/vsis3/bucket/key`."""
-    return str(path).startswith("/vsi")
-
-
 def gdal_name(path: Path) -> str:
-    """A path in GDAL's spelling: restores the second slash of an address, which `Path` removes."""
+    """A path in GDAL's spelling: restores the second slash of an address or of an archive, which `Path` removes."""
+    if is_archived(path):
+        return archive_name(path)
     return re.sub(r"^(/vsi\w+/(?:\w+=[^/]*/)?https?:)/(?!/)", r"\1//", str(path))
 
 
 def existing_file(path: Path, what: str) -> Path:
-    """The path, if it is a file. A path in a virtual file system of GDAL is not looked up.
+    """The path, if it is a file, in a folder or in an archive. A path on a server is not looked up.
 
     what : role of the file in messages ("image", "DEM").
 
     Raises
     ------
     InputError
-        There is no such file, it is a folder, or it lies in an archive.
+        There is no such file, it is a folder, or it lies in a virtual file system that is not read.
     """
     path = Path(path)
     if is_remote(path):
         if path.parts[1] not in REMOTE:
             raise InputError(
-                f"{quoted(str(path))} names a file in an archive or a stream, which is not followed. Unpack it, and "
-                f"give the {what} itself, or one on a server ({', '.join(f'/{name}/' for name in REMOTE[:3])}...)."
+                f"{quoted(str(path))} names a stream or an archive of a kind that is not followed. Unpack it, and give "
+                f"the {what} itself, or one on a server ({', '.join(f'/{name}/' for name in REMOTE[:3])}...)."
             )
         return path
     try:
-        is_there, is_folder = path.exists(), path.is_dir()
+        if is_archived(path):
+            is_folder = is_folder_in_archive(path)
+            is_there = is_folder or file_exists(path)
+        else:
+            is_there, is_folder = path.exists(), path.is_dir()
     except (OSError, ValueError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise InputError(f"There can be no {what} {quoted(str(path))}: {why.lower()}. Check the path.") from error
@@ -88,17 +95,6 @@ def existing_file(path: Path, what: str) -> Path:
     if not is_there:
         raise InputError(f"There is no {what} {path}. Check the path.")
     return path
-
-
-def file_state(path: Path) -> list[int]:
-    """Size (bytes) and modification time (ns) of a file; empty where it is missing or on a server."""
-    if is_remote(path):
-        return []
-    try:
-        status = path.stat()
-    except OSError:
-        return []
-    return [status.st_size, status.st_mtime_ns]
 
 
 @contextmanager
@@ -134,21 +130,15 @@ def cached_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
 
 
 def _opened(path: Path) -> rasterio.DatasetReader:
+    if is_tile_index(path):
+        layout = tile_layout(path, _tile_header)
+        return _dataset(path, layout.as_vrt(gdal_name), is_list=True)
     is_list = path.suffix.lower() == ".vrt"
     if is_list and not is_remote(path) and is_virtual(first_bytes(path)):
+        if is_archived(path):
+            raise InputError(f"{path} is a list of files in an archive, which is not followed. Unpack the archive.")
         check_virtual(path)
-    try:
-        with _warnings_lock, warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            # `rasterio.open` accepts only one driver.
-            dataset = rasterio.DatasetReader(gdal_name(path), driver=_drivers(is_list))
-    except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
-        if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
-            raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
-        raise InputError(
-            f"{path} cannot be opened as a raster: {gdal_message(error)}. Check that it is a complete "
-            "GeoTIFF (or another format of GDAL)."
-        ) from error
+    dataset = _dataset(path, gdal_name(path), is_list)
     if not is_remote(path):
         _check_block(dataset, path)
     elif dataset.driver == "VRT":
@@ -160,6 +150,36 @@ def _opened(path: Path) -> rasterio.DatasetReader:
     return dataset
 
 
+def _dataset(path: Path, name: str, is_list: bool) -> rasterio.DatasetReader:
+    """The raster that GDAL opens by a name. path : in messages; is_list : the driver of virtual rasters may open it."""
+    try:
+        with _warnings_lock, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            # `rasterio.open` accepts only one driver.
+            return rasterio.DatasetReader(name, driver=_drivers(is_list))
+    except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
+        if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
+            raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
+        raise InputError(
+            f"{path} cannot be opened as a raster: {gdal_message(error)}. Check that it is a complete "
+            "GeoTIFF (or another format of GDAL)."
+        ) from error
+
+
+def _tile_header(path: Path) -> TileHeader:
+    """The size and the bands of a tile of a product."""
+    first = first_bytes(path).lstrip()
+    if not first or is_virtual(first) or first.startswith((b"<", b"{", *ARCHIVES)):
+        raise InputError(f"The tile {path} is empty or holds no pixels itself. Copy the product again.")
+    with open_raster(path, "tile") as source:
+        return TileHeader(
+            source.shape,
+            source.dtypes[0],
+            tuple(meaning.name for meaning in source.colorinterp),
+            source.nodata,
+        )
+
+
 def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
     """Refuse a TIFF whose blocks would need far more memory than the file is large: a block is decoded as a whole."""
     if source.driver not in ("GTiff", "COG") or not source.count:
@@ -167,7 +187,7 @@ def _check_block(source: rasterio.DatasetReader, path: Path) -> None:
     bands = source.count if source.interleaving == Interleaving.pixel else 1
     kind = source.dtypes[0]
     pixel = PIXEL_BYTES[kind] if kind in PIXEL_BYTES else np.dtype(kind).itemsize
-    n_bytes, length = math.prod(source.block_shapes[0]) * bands * pixel, os.path.getsize(path)
+    n_bytes, length = math.prod(source.block_shapes[0]) * bands * pixel, byte_length(path)
     if n_bytes > max(LARGE_BLOCK_BYTES, MAX_COMPRESSION_RATIO * length):
         source.close()
         raise InputError(
@@ -181,15 +201,6 @@ def _drivers(virtual: bool) -> list[str]:
     """The drivers of GDAL that may open a file. virtual : include VRT."""
     with rasterio.Env() as gdal:
         return [name for name in gdal.drivers() if name not in INDIRECT_DRIVERS or (virtual and name == "VRT")]
-
-
-def first_bytes(path: Path) -> bytes:
-    """The first bytes of a file; empty where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(FIRST_BYTES)
-    except OSError:
-        return b""
 
 
 @contextmanager
@@ -213,7 +224,7 @@ class _OpenRasters(threading.local):
         """The open raster of a file; it is opened if it is not open, or if the file has changed."""
         state: tuple[int, ...] = (os.getpid(),)
         if not is_remote(path):
-            file = os.stat(path)
+            file = os.stat(stored_file(path))
             state += (file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns)
         known, dataset = self.datasets.get(path, (None, None))
         if known != state or dataset is None:
@@ -239,14 +250,15 @@ def check_complete(source: rasterio.DatasetReader, path: Path) -> HeldPixels | N
     """Check that a TIFF or PNG is not truncated, and return the parts that a sparse TIFF stores (None: everything).
 
     Offsets and sizes of all blocks or chunks are compared with the length of the file; nothing is decoded. Other
-    formats are not checked, because GDAL or `open_raster` detects truncation; neither are files on servers.
+    formats are not checked, because GDAL or `open_raster` detects truncation; neither are files on servers and files
+    that are compressed in an archive, whose checksum tells.
 
     Raises
     ------
     InputError
         Pixels lie behind the end of the file, or there are too many blocks.
     """
-    if is_remote(path):
+    if is_remote(path) or is_archived(path) or is_tile_index(path):
         return None
     if source.driver == "PNG":
         _check_png(path)

@@ -22,8 +22,9 @@ from zlocus.core.options import RunConfig
 from zlocus.core.resources import peak_memory_mb
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.config import config_as_dict
-from zlocus.io.open_raster import gdal_name, is_remote
+from zlocus.io.open_raster import gdal_name
 from zlocus.io.safe_documents import read_json
+from zlocus.io.stored_files import is_remote
 
 # Version of the keys of run.json and of the other JSON files of a result.
 SCHEMA = 2

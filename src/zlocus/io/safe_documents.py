@@ -17,7 +17,8 @@ from xml.parsers import expat
 import yaml
 
 from zlocus.core.errors import InputError
-from zlocus.io.safe_text import EXPORT_AGAIN, check_last_line_ended, quoted, read_bytes, read_text
+from zlocus.core.quoting import quoted
+from zlocus.io.safe_text import EXPORT_AGAIN, check_last_line_ended, read_bytes, read_text
 
 MAX_XML_DEPTH = 64
 MAX_YAML_DEPTH = 32

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from zlocus.core.errors import InputError
+from zlocus.io.archives import is_archived
+from zlocus.io.stored_files import byte_length, read_content
 
 EXPORT_AGAIN = "Export it again, or copy it again from its source."
-MAX_SHOWN_CHARACTERS = 40
 # Longer than any line of a table that a person or a program writes.
 MAX_LINE_CHARACTERS = 100_000
 # Larger than anything that is measured. A larger number is a sign of damage, and could overflow later.
@@ -31,16 +32,13 @@ def read_bytes(path: Path, max_bytes: int | None = None) -> bytes:
     InputError
         The file cannot be read, or is longer.
     """
-    try:
-        length = path.stat().st_size
-        if max_bytes is not None and length > max_bytes:
-            raise InputError(
-                f"{path} has {length} bytes, and no file of its kind has more than {max_bytes}. Check that it is the "
-                "right one."
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. Check the path.") from error
+    length = byte_length(path)
+    if max_bytes is not None and length > max_bytes:
+        raise InputError(
+            f"{path} has {length} bytes, and no file of its kind has more than {max_bytes}. Check that it is the right "
+            "one."
+        )
+    return read_content(path)
 
 
 def read_text(path: Path, max_bytes: int | None = None) -> str:
@@ -70,7 +68,7 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """
     above: set[tuple[int, int] | None] = set()
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with io.StringIO(read_text(path)) if is_archived(path) else path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
                 words = WORD.findall(line)
                 last = digits_written(words[-1]) if words else None
@@ -123,9 +121,3 @@ def decimal(text: str) -> float:
 def is_decimal(text: str) -> bool:
     """Whether a text is a plain decimal number."""
     return DECIMAL.fullmatch(text) is not None
-
-
-def quoted(value: Any) -> str:
-    """A value in quotation marks for a message, shortened to `MAX_SHOWN_CHARACTERS`."""
-    text = value if isinstance(value, str) else repr(value)
-    return repr(text if len(text) <= MAX_SHOWN_CHARACTERS else text[:MAX_SHOWN_CHARACTERS] + "...")

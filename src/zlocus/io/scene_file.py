@@ -22,14 +22,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import numpy as np
 import yaml
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import ConfigError, InputError, ZlocusError
-from zlocus.core.scene import Scene, View, held_window, is_local
+from zlocus.core.quoting import quoted
+from zlocus.core.scene import Acquisition, Scene, View, held_window, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
@@ -44,14 +44,14 @@ from zlocus.io.images import (
     open_header,
     with_plateau,
 )
+from zlocus.io.local_axes import is_along, rotation_to_axes
 from zlocus.io.open_raster import existing_file
+from zlocus.io.resolved_entry import ResolvedEntry, entries_of
 from zlocus.io.safe_documents import read_yaml
-from zlocus.io.safe_text import quoted
 from zlocus.io.schema import FiniteNumber, StrictModel, validate_document
 from zlocus.sensors.frame import FrameModel
 
 SCENE_SUFFIXES = (".yaml", ".yml")
-OPPOSITE_TOLERANCE, PARALLEL_TOLERANCE = 1e-12, 1e-6
 T = TypeVar("T")
 
 
@@ -77,7 +77,7 @@ class Frame(StrictModel):
             raise ValueError("up is a direction: one of its three numbers is not 0")
         if self.north is not None and self.up is None:
             raise ValueError("north needs up, which says about what the frame is turned: add up: [x, y, z]")
-        if self.up is not None and self.north is not None and _is_along(self.up, self.north):
+        if self.up is not None and self.north is not None and is_along(self.up, self.north):
             raise ValueError("north is a direction at an angle to up: give one that is neither along up nor 0")
         return self
 
@@ -197,7 +197,7 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
     scene_input = _inputs_of_scene(inputs, crs, refused_entries)
     refused_by_name: dict[str, RefusedView] = {}
 
-    def attempt(entry: _ResolvedEntry, step: Callable[[], T]) -> list[T]:
+    def attempt(entry: ResolvedEntry, step: Callable[[], T]) -> list[T]:
         try:
             return [step()]
         except ZlocusError as error:
@@ -273,20 +273,10 @@ def write_scene_file(path: Path, scene_file: SceneFile) -> None:
 
 
 @dataclass(frozen=True)
-class _ResolvedEntry:
-    """A view before its image is opened. path : of the image."""
-
-    name: str
-    path: Path
-    camera: CameraEntry
-    date: datetime.date | None = None
-
-
-@dataclass(frozen=True)
 class _SceneInput:
     """A scene before any image is opened. folder : base of relative paths of cameras; up, north : see `Frame`."""
 
-    entries: tuple[_ResolvedEntry, ...]
+    entries: tuple[ResolvedEntry, ...]
     folder: Path
     crs: CRS | None
     bounds: tuple[float, float, float, float] | None = None
@@ -304,7 +294,7 @@ class _SceneInput:
 class _OpenedView:
     """An opened image and its camera, before the CRS of the scene is known."""
 
-    entry: _ResolvedEntry
+    entry: ResolvedEntry
     image: RasterImage
     camera: OpenedCamera
 
@@ -318,8 +308,8 @@ class _OpenedView:
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
         entry = self.entry
-        date, sun_direction = entry.date or self.image.date, self.image.sun_direction
-        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, date, sun_direction)
+        acquisition = entry.acquisition.completed_by(self.image.acquisition)
+        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, acquisition)
 
 
 def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[RefusedView] | None = None) -> _SceneInput:
@@ -330,25 +320,22 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[Refu
     if scene_files:
         scene_input = _from_scene_file(scene_files[0], crs, refused)
     else:
-        entries = [
-            _ResolvedEntry(name, path, RpcCamera()) for name, path in zip(_unique_names(paths), paths, strict=True)
-        ]
-        scene_input = _SceneInput(tuple(entries), Path(), crs)
+        scene_input = _SceneInput(entries_of(paths), Path(), crs)
     if scene_input.crs is not None and not is_local(scene_input.crs):
         scene_input = replace(scene_input, crs=checked_crs(scene_input.crs))
     _check_distinct([entry.path for entry in scene_input.entries])
     return scene_input
 
 
-def _open_view(entry: _ResolvedEntry, folder: Path) -> _OpenedView:
+def _open_view(entry: ResolvedEntry, folder: Path) -> _OpenedView:
     """A view of which only the header and the camera have been read."""
-    image = open_header(entry.path)
+    image = open_header(entry.path, entry.colour_image)
     return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
 
 
-def _open_checked_view(entry: _ResolvedEntry, folder: Path) -> _OpenedView:
+def _open_checked_view(entry: ResolvedEntry, folder: Path) -> _OpenedView:
     """A view whose pixels have been checked."""
-    image = _checked(open_header(entry.path))
+    image = _checked(open_header(entry.path, entry.colour_image))
     return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
 
 
@@ -375,7 +362,7 @@ def _from_scene_file(path: Path, crs: CRS | None, refused: list[RefusedView] | N
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     named = None if scene_file.frame is None else scene_file.frame.crs
     entries = tuple(
-        _ResolvedEntry(view.name, path.parent / view.image, view.camera.with_default_crs(named), view.date)
+        ResolvedEntry(view.name, path.parent / view.image, view.camera.with_default_crs(named), Acquisition(view.date))
         for view in scene_file.views
     )
     bounds = None if scene_file.area is None else scene_file.area.bounds
@@ -390,39 +377,6 @@ def _rotated(scene: Scene, rotation: FloatArray) -> Scene:
         assert isinstance(view.sensor, FrameModel), "other cameras know their place on the Earth"
         views.append(replace(view, sensor=view.sensor.turned(rotation)))
     return replace(scene, views=tuple(views))
-
-
-def rotation_to_z(up: tuple[float, float, float]) -> FloatArray:
-    """The smallest rotation (3, 3) that turns a direction into the z axis; for -z half a turn about x."""
-    x, y, z = np.array(up) / np.max(np.abs(up))
-    x, y, z = np.array([x, y, z]) / np.linalg.norm([x, y, z])
-    if z < -1.0 + OPPOSITE_TOLERANCE:
-        return np.diag([1.0, -1.0, -1.0])
-    # Rodrigues' formula about the axis up x z, with 1 + cosine = 1 + z.
-    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
-
-
-def rotation_to_axes(up: tuple[float, float, float], north: tuple[float, float, float] | None) -> FloatArray:
-    """The rotation (3, 3) that turns `up` into the z axis, and the part of `north` at right angles to it into the y
-    axis.
-
-    Without `north` it is the smallest rotation.
-    """
-    rotation = rotation_to_z(up)
-    if north is None:
-        return rotation
-    x, y, _ = rotation @ (np.array(north) / np.max(np.abs(north)))
-    x, y = np.array([x, y]) / np.hypot(x, y)
-    return np.asarray(np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ rotation)
-
-
-def _is_along(up: tuple[float, float, float], north: tuple[float, float, float]) -> bool:
-    """Whether two directions are parallel or opposite, to rounding, or the second is zero."""
-    if not any(north):
-        return True
-    one, other = (np.array(v) / np.max(np.abs(v)) for v in (up, north))
-    return bool(np.linalg.norm(np.cross(one, other)) < PARALLEL_TOLERANCE)
 
 
 def _frame_crs(frame: Frame, path: Path) -> CRS:
@@ -466,18 +420,6 @@ def _check_distinct(paths: Sequence[Path]) -> None:
         if path.resolve() in known_paths:
             raise InputError(f"{path} is given twice. Each image counts once; remove one.")
         known_paths.add(path.resolve())
-
-
-def _unique_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each image: the first that is unique of its stem, parent/stem, and path without suffix."""
-    names = [path.stem for path in paths]
-    for depth in (1, 2):
-        doubled = {name for name in names if names.count(name) > 1}
-        for i, path in enumerate(paths):
-            if names[i] in doubled:
-                whole = path.resolve()
-                names[i] = f"{whole.parent.name}/{whole.stem}" if depth == 1 else whole.with_suffix("").as_posix()
-    return names
 
 
 def _camera(value: Any, path: Path, where: str) -> Any:

@@ -9,7 +9,8 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from zlocus.core.errors import InputError
-from zlocus.io.safe_text import MAX_MAGNITUDE, is_decimal, quoted
+from zlocus.core.quoting import quoted
+from zlocus.io.safe_text import MAX_MAGNITUDE, is_decimal
 
 
 def _plain(value: Any) -> Any:

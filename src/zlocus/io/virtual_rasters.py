@@ -14,11 +14,11 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import quoted
+from zlocus.io.stored_files import FIRST_BYTES
 
 MARK = b"<vrtdataset"  # a VRT holds this, in any case, within the first bytes, at which GDAL looks
-FIRST_BYTES = 1024
 # GDAL's virtual file systems that may be read: files on servers, but nothing inside an archive.
 REMOTE = ("vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsihdfs", "vsiwebhdfs")
 # First bytes of archives.

@@ -18,8 +18,8 @@ from zlocus.core.jit import kernels_digest
 from zlocus.core.progress import duration
 from zlocus.core.requests import FINISHED, held_files
 from zlocus.io.input_files import InputFiles
-from zlocus.io.open_raster import file_state
 from zlocus.io.run_record import inputs_record, read_record, versions_record
+from zlocus.io.stored_files import file_state
 from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileCheckpoint, write_atomically
 from zlocus.pipeline.execution.packed_values import packed, unpacked
 from zlocus.pipeline.finished_record import read_finished

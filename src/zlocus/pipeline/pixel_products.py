@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.core.grid import CellWindow
-from zlocus.core.scene import Scene, View, is_local
+from zlocus.core.scene import ColourSource, ImageSource, Scene, View, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.colour import read_colours
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.fill import filled_from_behind
 from zlocus.matching.image_space import ROWS_AT_ONCE
@@ -50,7 +49,7 @@ class PointWriter:
                 continue
             xyz = space.ground(row, height, window.col)[known]
             xyz[:, 2] -= self._datum.undulation(xyz[:, :2], self._scene.crs)
-            colours = read_colours(view.path, row, n_rows, window.col, window.cols)[known]
+            colours = read_colours(view.image, row, window.col, n_rows, window.cols)[known]
             rgb = np.rint(np.clip(colours / self._white, 0.0, 1.0) * 65535.0).astype(np.uint16)
             sigma_m = precision_m(matched_pixels, CellWindow(row, window.col, n_rows, window.cols), known)
             self._cloud.write(self._number[view.name], xyz, rgb, sigma_m, matched_pixels.surface.views[part][known])
@@ -75,6 +74,19 @@ def strips(n_rows: int) -> Iterator[tuple[int, int]]:
     return ((first, end - first) for first, end in pairwise(edges))
 
 
+def read_colours(image: ImageSource, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
+    """The colours of a window of an image, (r, c, 3) float32, in the file's own numbers; grey where it has none.
+
+    Raises
+    ------
+    InputError
+        The file can no longer be read.
+    """
+    if isinstance(image, ColourSource) and image.has_colours:
+        return np.ascontiguousarray(np.moveaxis(image.colours(row, col, rows, cols), 0, -1))
+    return np.repeat(image.read(row, col, rows, cols).pixels[..., np.newaxis], 3, axis=-1)
+
+
 def white_level(views: Sequence[View]) -> float:
     """The grey value that is shown as white: 255 for 8-bit images, else a value that few pixels exceed."""
     if all(view.image.dtype == "uint8" for view in views):
@@ -84,7 +96,7 @@ def white_level(views: Sequence[View]) -> float:
         rows, cols = view.image.shape
         for row in np.unique(np.linspace(0, rows - 1, WHITE_ROWS).astype(int)):
             valid = view.image.read(int(row), 0, 1, cols).valid
-            numbers.append(read_colours(view.path, int(row), 1)[valid].max(axis=-1))
+            numbers.append(read_colours(view.image, int(row), 0, 1, cols)[valid].max(axis=-1))
     known = np.concatenate(numbers)
     return max(float(np.percentile(known, WHITE_PERCENT)), 1e-6) if len(known) else 1.0
 

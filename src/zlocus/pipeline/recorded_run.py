@@ -13,7 +13,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.io.config import config_from_dict
-from zlocus.io.open_raster import is_remote
+from zlocus.io.stored_files import is_remote
 
 # Fields of a request that name files. --vertical and --dem-vertical may name files, too.
 FILES = ("like", "area", "mask", "dem")

@@ -12,8 +12,9 @@ from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.request_checks import is_scene_file
 from zlocus.core.requests import CloudRequest, DsmRequest, SetupRequest, check_output
 from zlocus.core.rerun_request import RerunRequest
-from zlocus.io.open_raster import is_remote
+from zlocus.io.archives import is_archived
 from zlocus.io.run_record import inputs_record, processor_name, read_record, versions_record
+from zlocus.io.stored_files import is_remote
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.fingerprint import COMMANDS, kernels_of_package
@@ -210,7 +211,11 @@ class Places:
         kept = [
             name
             for name in asked["inputs"]
-            if name in self.read or is_remote(Path(name)) or is_scene_file(Path(name)) or self.of(name).is_file()
+            if name in self.read
+            or is_remote(Path(name))
+            or is_archived(Path(name))
+            or is_scene_file(Path(name))
+            or self.of(name).exists()
         ]
         return {**asked, "inputs": kept}
 

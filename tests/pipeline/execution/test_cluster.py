@@ -40,12 +40,17 @@ class Loopback:
         }  # fmt: skip
         where = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
         self.scheduler = self._started("scheduler", *where, "--scheduler-file", str(self._file))
-        end = time.monotonic() + 60
-        while not self._file.exists():
-            assert time.monotonic() < end, "the scheduler did not start"
-            time.sleep(0.05)
-        self.address = json.loads(self._file.read_text())["address"]
+        self.address = self._address()
         self.workers: list[subprocess.Popen[bytes]] = []
+
+    def _address(self) -> str:
+        """The address in the scheduler's file, once the file is there and complete."""
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            if self._file.exists() and (text := self._file.read_text()).rstrip().endswith("}"):
+                return str(json.loads(text)["address"])
+            time.sleep(0.05)
+        raise AssertionError("the scheduler did not start")
 
     def add_worker(self) -> None:
         """Start one, of one thread, that nobody starts again."""

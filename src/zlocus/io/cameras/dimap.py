@@ -14,9 +14,12 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.io.cameras.rpc_text import POLYNOMIALS, SCALARS, rpc_from_fields
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal, quoted
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal
+from zlocus.io.stored_files import file_exists, names_beside
+from zlocus.io.tiled_products import DIMAP_INDEX, whole_number
 from zlocus.sensors.rpc import RpcCoefficients
 
 TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)
@@ -24,13 +27,16 @@ TILE = re.compile(r"_R(\d+)C(\d+)$", re.IGNORECASE)
 
 def find_dimap(image: Path) -> Path | None:
     """The RPC_*.XML of an image by its name (IMG_id_R1C1.TIF: RPC_id.XML), else a DIM_*.XML that lists it, or None."""
+    if DIMAP_INDEX.fullmatch(image.name):
+        return image
     name = TILE.sub("", re.sub(r"^IMG_", "", image.stem))
     for suffix in (".XML", ".xml"):
         path = image.with_name(f"RPC_{name}{suffix}")
-        if path.exists():
+        if file_exists(path):
             return path
-    for path in sorted(image.parent.glob("DIM_*.[xX][mM][lL]")):
-        if _data_file(read_xml(path), image) is not None:
+    for beside in names_beside(image):
+        path = image.with_name(beside)
+        if DIMAP_INDEX.fullmatch(beside) and _data_file(read_xml(path), image) is not None:
             return path
     return None
 
@@ -42,7 +48,7 @@ def read_dimap_rpc(path: Path, image: Path) -> RpcCoefficients:
     """
     root = read_xml(path)
     if root.find(".//RFM_Validity") is None:
-        path = _named_rpc_file(root, path)
+        path = rpc_file_of(path, root)
         root = read_xml(path)
     model = root.find(".//Inverse_Model")
     model = root.find(".//GroundtoImage_Values") if model is None else model
@@ -67,7 +73,7 @@ def _tile_origin(path: Path, image: Path) -> tuple[int, int]:
     if tile is None or (int(tile[1]), int(tile[2])) == (1, 1):
         return 0, 0
     dim = path.with_name(re.sub(r"^RPC_", "DIM_", path.name))
-    if not dim.exists():
+    if not file_exists(dim):
         raise InputError(
             f"{image} is a tile of a larger product whose RPC counts its pixels, and {dim} is missing. Add it."
         )
@@ -79,16 +85,10 @@ def _tile_origin(path: Path, image: Path) -> tuple[int, int]:
         raise InputError(
             f"{dim} does not say where {image.name} lies in the product. Mosaic the tiles first (gdalbuildvrt)."
         )
-    rows, cols = (_whole(size, name, dim) for name in ("nrows", "ncols"))
-    return (_whole(entry, "tile_R", dim) - 1) * rows, (_whole(entry, "tile_C", dim) - 1) * cols
-
-
-def _whole(element: Element, name: str, path: Path) -> int:
-    """An attribute that is a whole number from 1 on."""
-    text = element.attrib.get(name, "")
-    if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):
-        raise InputError(f"{path}: {name} is {quoted(text)}, not a whole number above 0. {EXPORT_AGAIN}")
-    return int(text)
+    rows, cols = (whole_number(size.get(name), name, dim) for name in ("nrows", "ncols"))
+    return (whole_number(entry.get("tile_R"), "tile_R", dim) - 1) * rows, (
+        whole_number(entry.get("tile_C"), "tile_C", dim) - 1
+    ) * cols
 
 
 def _first_pixel(domain: Element, name: str, path: Path) -> float:
@@ -108,14 +108,22 @@ def _data_file(root: Element, image: Path) -> Element | None:
     return None
 
 
-def _named_rpc_file(root: Element, path: Path) -> Path:
-    """The RPC_*.XML to which a DIM_*.XML refers, else the one with the same name."""
+def rpc_file_of(path: Path, root: Element) -> Path:
+    """The RPC_*.XML to which a DIM_*.XML refers, else the one with the same name.
+
+    root : of the DIM_*.XML.
+
+    Raises
+    ------
+    InputError
+        There is neither.
+    """
     for element in root.iter():
         name = Path(element.attrib.get("href", "")).name
-        if re.fullmatch(r"RPC_.*\.XML", name, re.IGNORECASE) and path.with_name(name).exists():
+        if re.fullmatch(r"RPC_.*\.XML", name, re.IGNORECASE) and file_exists(path.with_name(name)):
             return path.with_name(name)
     sibling = path.with_name(re.sub(r"^DIM_", "RPC_", path.name))
-    if sibling == path or not sibling.exists():
+    if sibling == path or not file_exists(sibling):
         raise InputError(f"{path} holds no RPC and names none that exists. Add the RPC_*.XML of the product beside it.")
     return sibling
 

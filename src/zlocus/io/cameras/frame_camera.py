@@ -19,12 +19,12 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.camera_entry import CameraEntry, Vector
 from zlocus.io.crs import checked_crs
 from zlocus.io.open_raster import open_raster
-from zlocus.io.safe_text import quoted
 from zlocus.io.schema import FiniteNumber, StrictModel
 from zlocus.sensors.distortion import BrownDistortion, Distortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import between

@@ -10,8 +10,11 @@ from pathlib import Path
 
 from zlocus.core.errors import InputError
 from zlocus.io.cameras.dimap import find_dimap, read_dimap_rpc
+from zlocus.io.cameras.isd import is_isd, read_isd_rpc
 from zlocus.io.cameras.rpc_text import read_rpb, read_rpc_txt, rpc_from_fields
 from zlocus.io.open_raster import existing_file, open_raster
+from zlocus.io.stored_files import file_exists
+from zlocus.io.vendor_xml import plain_xml
 from zlocus.sensors.rpc import RpcCoefficients
 
 RPB_SUFFIXES = (".RPB", ".rpb")
@@ -22,7 +25,7 @@ def read_rpc(image: Path, file: Path | None = None) -> RpcCoefficients:
     """The RPC of an image.
 
     It is searched in GDAL's order, in which a side-car file has precedence because it often corrects the tag: `file` if
-    given; NAME.RPB; NAME_RPC.TXT; DIMAP (RPC_*.XML); the tag in the image.
+    given; NAME.RPB; NAME_RPC.TXT; NAME.XML of Maxar; DIMAP (RPC_*.XML); the tag in the image.
 
     Raises
     ------
@@ -35,7 +38,7 @@ def read_rpc(image: Path, file: Path | None = None) -> RpcCoefficients:
         return _from_tag(image)
     suffix = file.suffix.lower()
     if suffix == ".xml":
-        return read_dimap_rpc(file, image)
+        return read_isd_rpc(file) if is_isd(plain_xml(file)) else read_dimap_rpc(file, image)
     if suffix == ".rpb":
         return read_rpb(file)
     if suffix == ".txt":
@@ -47,9 +50,20 @@ def find_sidecar(image: Path) -> Path | None:
     """The file beside an image that holds its RPC; None where there is none."""
     names = [image.stem + suffix for suffix in RPB_SUFFIXES] + [image.stem + ending for ending in TXT_ENDINGS]
     for name in names:
-        if image.with_name(name).exists():
+        if file_exists(image.with_name(name)):
             return image.with_name(name)
-    return find_dimap(image)
+    return _isd_with_rpc(image) or find_dimap(image)
+
+
+def _isd_with_rpc(image: Path) -> Path | None:
+    """The XML of image support data of Maxar beside an image, if it holds an RPC."""
+    for suffix in (".XML", ".xml"):
+        file = image.with_suffix(suffix)
+        if file_exists(file) and file != image:
+            root = plain_xml(file)
+            if is_isd(root) and root.find("RPB") is not None:
+                return file
+    return None
 
 
 def _from_tag(image: Path) -> RpcCoefficients:

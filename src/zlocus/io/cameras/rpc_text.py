@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.safe_text import (
     BYTE_ORDER_MARK,
@@ -17,7 +18,6 @@ from zlocus.io.safe_text import (
     decimal,
     digits_written,
     is_decimal,
-    quoted,
     read_bytes,
     truncation_error,
 )

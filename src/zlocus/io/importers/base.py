@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.open_raster import existing_file
-from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal, quoted
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_MAGNITUDE, decimal
 
 ROTATION_TOLERANCE = 1e-3
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.io.importers.base import (
     ImportedCameras,
@@ -23,7 +24,7 @@ from zlocus.io.importers.base import (
     read_numbers,
     rotation_matrix,
 )
-from zlocus.io.safe_text import EXPORT_AGAIN, quoted, text_lines
+from zlocus.io.safe_text import EXPORT_AGAIN, text_lines
 
 FILES = ("bundle.out", "bundle/bundle.out", "bundle.rd.out", "bundler.out")
 LISTS = ("list.txt", "../list.txt", "bundle.out.list.txt", "bundle.rd.out.list.txt")

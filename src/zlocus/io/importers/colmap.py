@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.importers.base import (
@@ -27,7 +28,7 @@ from zlocus.io.importers.base import (
     read_number,
     read_numbers,
 )
-from zlocus.io.safe_text import EXPORT_AGAIN, quoted, read_bytes, text_lines
+from zlocus.io.safe_text import EXPORT_AGAIN, read_bytes, text_lines
 
 FOLDERS = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
 # Number, name, kind of distortion, and parameters. f, or fx and fy; cx, cy; coefficients.

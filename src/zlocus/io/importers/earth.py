@@ -10,9 +10,9 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import checked_crs, utm_zone
-from zlocus.io.safe_text import quoted
 from zlocus.sensors.earth_frame import EarthSpace, between
 
 

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.io.cameras.frame_camera import Interior
 from zlocus.io.importers.base import ImportedCameras, ImportedExposure, find_camera_file, read_number
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_yaml
-from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, decimal, quoted, text_lines
+from zlocus.io.safe_text import EXPORT_AGAIN, MAX_LINE_CHARACTERS, decimal, text_lines
 from zlocus.io.schema import validate_document
 from zlocus.sensors.frame import rotation_from_angles
 

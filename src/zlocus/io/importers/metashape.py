@@ -18,6 +18,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import is_in_metres, is_on_earth
@@ -32,7 +33,7 @@ from zlocus.io.importers.base import (
 )
 from zlocus.io.importers.earth import map_poses, scene_file_crs
 from zlocus.io.safe_documents import read_xml
-from zlocus.io.safe_text import EXPORT_AGAIN, quoted
+from zlocus.io.safe_text import EXPORT_AGAIN
 
 FILES = ("cameras.xml", "metashape.xml", "agisoft.xml")
 LENSES = {

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.importers.base import (
@@ -27,7 +28,7 @@ from zlocus.io.importers.base import (
 )
 from zlocus.io.importers.earth import map_poses, scene_file_crs
 from zlocus.io.safe_documents import read_json
-from zlocus.io.safe_text import EXPORT_AGAIN, quoted
+from zlocus.io.safe_text import EXPORT_AGAIN
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, east_north_up
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json", "opensfm_reconstruction.json")

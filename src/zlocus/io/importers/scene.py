@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from zlocus.core.errors import ConfigError, InputError, OutputError
+from zlocus.core.quoting import quoted
 from zlocus.core.requests import ImportRequest
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.importers.base import ImportedCameras, ImportedExposure
 from zlocus.io.importers.earth import parsed_crs, scene_file_crs
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.open_raster import open_raster
-from zlocus.io.safe_text import EXPORT_AGAIN, quoted
+from zlocus.io.safe_text import EXPORT_AGAIN
 from zlocus.io.scene_file import SceneFile, ViewEntry, write_scene_file
 from zlocus.io.schema import validate_document
 from zlocus.sensors.frame import as_row, as_rows

@@ -9,7 +9,8 @@ import numpy as np
 
 from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.scene_file import read_scene_file, rotation_to_axes
+from zlocus.io.local_axes import rotation_to_axes
+from zlocus.io.scene_file import read_scene_file
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.doctor.findings import POOR, Finding

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import tarfile
+
+import numpy as np
+import pytest
+
+from made_up_deliveries import (
+    CLOUD,
+    FIRST_TIME,
+    OFF_NADIR,
+    SUN_AZIMUTH,
+    SUN_ELEVATION,
+    VIEW_AZIMUTH,
+    VIEW_ELEVATION,
+    dimap_delivery,
+    gaofen_delivery,
+    maxar_delivery,
+    nitf_delivery,
+    planet_delivery,
+    shots,
+    stac_delivery,
+    write_single,
+    zipped,
+)
+from zlocus.core.errors import InputError
+from zlocus.core.scene import SunDirection
+from zlocus.io.deliveries.delivery import is_delivery, open_delivery
+from zlocus.io.scene_file import open_scene
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+NAMESPACE = "http://xsd.digitalglobe.com/xsd/dm"
+# Vendor: how its delivery is written, satellite in the names of views, and whether it has all kinds of metadata.
+VENDORS = {
+    "dimap": (dimap_delivery, "PHR1A"),
+    "dimap of one tile": (lambda root, taken: dimap_delivery(root, taken, None), "PHR1A"),
+    "maxar": (maxar_delivery, "WV03"),
+    "maxar isd": (lambda root, taken: maxar_delivery(root, taken, isd=""), "WV03"),
+    "maxar isd with a namespace": (lambda root, taken: maxar_delivery(root, taken, isd=NAMESPACE), "WV03"),
+    "planet": (planet_delivery, "SSC2"),
+    "gaofen": (gaofen_delivery, "GF2-PMS1"),
+    "stac": (stac_delivery, "WV03"),
+}
+
+
+@pytest.fixture(scope="module")
+def taken(images):
+    return shots({name: images("sine").paths[name] for name in ("nadir", "fore")})
+
+
+@pytest.fixture(scope="module")
+def made(taken, tmp_path_factory):
+    """A delivery of each vendor, made once: `made(vendor)`."""
+    known = {}
+
+    def of(vendor):
+        if vendor not in known:
+            known[vendor] = VENDORS[vendor][0](tmp_path_factory.mktemp("vendor") / "delivery", taken)
+        return known[vendor]
+
+    return of
+
+
+def pixels(view):
+    return view.image.read(0, 0, *view.image.shape).pixels
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_a_delivery_gives_the_pixels_and_cameras_of_single_files(made, taken, tmp_path, vendor):
+    scene = open_scene([made(vendor)])
+    single = open_scene([write_single(tmp_path, shot) for shot in taken])
+    satellite = VENDORS[vendor][1]
+    assert [view.name for view in scene.views] == [f"{satellite}_{shot.time:%Y%m%dT%H%M%S}" for shot in taken]
+    for view, other, shot in zip(scene.views, single.views, taken, strict=True):
+        assert np.array_equal(pixels(view), shot.grey)
+        assert np.array_equal(pixels(view), pixels(other))
+        # The offsets of DIMAP are one pixel larger in the file, and may lose their last digit.
+        np.testing.assert_allclose(view.sensor.rpc.matrix, other.sensor.rpc.matrix, rtol=1e-14)
+        assert view.sensor.rpc.line_off == pytest.approx(other.sensor.rpc.line_off, abs=1e-9)
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_what_vendors_say_of_the_exposure(made, taken, vendor):
+    for view, shot in zip(open_scene([made(vendor)]).views, taken, strict=True):
+        said = view.acquisition
+        assert (said.time, said.date) == (shot.time, FIRST_TIME.date())
+        assert said.sun_direction == SunDirection(SUN_AZIMUTH, pytest.approx(SUN_ELEVATION))
+        assert said.view_azimuth_deg == pytest.approx(VIEW_AZIMUTH)
+        assert said.cloud_cover == CLOUD
+        if vendor != "gaofen":
+            assert said.off_nadir_deg == OFF_NADIR
+        if vendor != "planet":
+            assert said.incidence_deg == pytest.approx(90 - VIEW_ELEVATION)
+
+
+def smoothed(bands, axis):
+    """A band after interpolation at four places of each pixel, 3/8 and 1/8 of a pixel from its centre to both sides,
+    of which the two inner ones are averaged."""
+    before, after = (np.roll(bands, shift, axis) for shift in (1, -1))
+    return 0.875 * bands + 0.0625 * (before + after)
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_colours_are_those_of_the_multispectral_image(made, taken, vendor):
+    """The centres of the larger pixels lie between the pixels 1 and 2 of each four."""
+    for view, shot in zip(open_scene([made(vendor)]).views, taken, strict=True):
+        colours = view.image.colours(0, 0, *view.image.shape)
+        found = np.mean([colours[:, i::4, j::4] for i in (1, 2) for j in (1, 2)], axis=0)
+        expected = smoothed(smoothed(shot.bands("RGB").astype(float), 1), 2)
+        inner = (slice(None), slice(1, -1), slice(1, -1))
+        # Interpolation works in 32nds of a pixel.
+        np.testing.assert_allclose(found[inner], expected[inner], atol=0.03 * expected.std())
+        part = view.image.colours(9, 21, 30, 40)
+        np.testing.assert_allclose(part, colours[:, 9:39, 21:61], atol=0.03 * expected.std())
+
+
+def test_nitf_files_of_a_folder(taken, tmp_path):
+    scene = open_scene([nitf_delivery(tmp_path / "n", taken)])
+    for view, shot in zip(sorted(scene.views, key=lambda view: view.acquisition.time), taken, strict=True):
+        assert np.array_equal(pixels(view), shot.grey)
+        assert view.acquisition.time == shot.time
+
+
+@pytest.mark.parametrize("vendor", ["dimap", "maxar", "planet", "gaofen"])
+@pytest.mark.parametrize("kind", ["zip", "tar", "tgz"])
+def test_archives_are_read_in_place(made, taken, tmp_path, vendor, kind):
+    folder, archive = made(vendor), tmp_path / f"d.{kind}"
+    if kind == "zip":
+        zipped(folder, archive)
+    else:
+        with tarfile.open(archive, "w" if kind == "tar" else "w:gz") as file:
+            file.add(folder, "delivery")
+    scene = open_scene([archive])
+    assert [view.name for view in scene.views] == [view.name for view in open_scene([folder]).views]
+    for view, shot in zip(scene.views, taken, strict=True):
+        assert np.array_equal(pixels(view), shot.grey)
+        assert view.image.has_colours
+    assert sorted(path.name for path in tmp_path.iterdir()) == [archive.name]
+
+
+def test_a_folder_in_an_archive_and_one_index_are_inputs_too(made, taken, tmp_path):
+    archive = zipped(made("dimap"), tmp_path / "d.zip")
+    inside = [f"/vsizip/{archive}/delivery/PROD_{shot.name}" for shot in taken]
+    assert len(open_scene([*map(type(archive), inside)]).views) == 2
+    indices = sorted(made("dimap").rglob("DIM_*_P_*.XML")) + sorted(made("maxar").rglob("*.TIL"))[:1]
+    scene = open_scene(indices)
+    assert [view.name for view in scene.views][:2] == [f"PHR1A_{shot.time:%Y%m%dT%H%M%S}" for shot in taken[::-1]]
+    assert np.array_equal(pixels(scene.views[2]), taken[0].grey)
+
+
+def test_a_table_of_dates_completes_and_corrects(taken, tmp_path):
+    for shot in taken:
+        write_single(tmp_path, shot)
+    (tmp_path / "dates.csv").write_text(
+        "image,acquired_utc_yyyymmddhhmmss,sun_elevation_deg,sun_azimuth_deg\n"
+        "nadir.tif,20150607080910,50.8,150.3\nfore.tif,20150607081010,,\n"
+    )
+    fore, nadir = sorted(open_scene([tmp_path]).views, key=lambda view: view.path.name)
+    assert (nadir.name, fore.name) == ("20150607T080910", "20150607T081010")
+    assert nadir.sun_direction == SunDirection(150.3, 50.8)
+    assert fore.sun_direction is None
+
+
+def test_what_is_a_delivery(tmp_path, made):
+    assert is_delivery(tmp_path)
+    assert is_delivery(tmp_path / "a.zip")
+    assert not is_delivery(tmp_path / "a.tif")
+
+
+def test_a_folder_without_images_says_so(tmp_path):
+    (tmp_path / "readme.txt").write_text("nothing")
+    with pytest.raises(InputError, match=r"holds no image with a camera\. Give the folder that the vendor delivered"):
+        open_delivery(tmp_path)

@@ -1,0 +1,280 @@
+"""Deliveries that are damaged, contradict themselves, or want to do harm: each ends in one sentence."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tarfile
+import zipfile
+
+import numpy as np
+import pytest
+
+from made_up_deliveries import dimap_delivery, maxar_delivery, shots, stac_delivery, write_single, zipped
+from rpc_fixtures import write_image
+from zlocus.core.errors import InputError
+from zlocus.io.archives import SMALL_BYTES
+from zlocus.io.deliveries.delivery import open_delivery
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture(scope="module")
+def taken(images):
+    return shots({name: images("sine").paths[name] for name in ("nadir", "fore")})
+
+
+def refused(path):
+    """The sentence with which a delivery is refused."""
+    with pytest.raises(InputError) as caught:
+        open_delivery(path)
+    sentence = str(caught.value)
+    assert sentence.endswith(".")
+    assert "\n" not in sentence
+    return sentence
+
+
+def one(root, pattern):
+    return sorted(root.rglob(pattern))[0]
+
+
+def changed(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def archive_with(path, name, content=b"x", **attributes):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        info = zipfile.ZipInfo(name)
+        for key, value in attributes.items():
+            setattr(info, key, value)
+        file.writestr(info, content)
+    return path
+
+
+@pytest.mark.parametrize("name", ["../out.tif", "/etc/passwd", "a/../../b.tif", "C:/x.tif", "a\\b.tif", "a\nb.tif"])
+def test_names_that_leave_an_archive(tmp_path, name):
+    # `zipfile` mends some names as it writes them, but not as it reads them.
+    archive_with(tmp_path / "d.zip", "N" * len(name))
+    content = (tmp_path / "d.zip").read_bytes()
+    (tmp_path / "d.zip").write_bytes(content.replace(b"N" * len(name), name.encode()))
+    assert "leaves the archive" in refused(tmp_path / "d.zip")
+    with tarfile.open(tmp_path / "d.tar", "w") as file:
+        file.addfile(tarfile.TarInfo(name))
+    assert "leaves the archive" in refused(tmp_path / "d.tar")
+
+
+def test_links_in_archives(tmp_path):
+    archive_with(tmp_path / "d.zip", "img.tif", b"/etc/passwd", external_attr=0o120777 << 16, create_system=3)
+    assert "which is a link" in refused(tmp_path / "d.zip")
+    for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE):
+        with tarfile.open(tmp_path / "d.tar", "w") as file:
+            info = tarfile.TarInfo("img.tif")
+            info.type, info.linkname = kind, "/etc/passwd"
+            file.addfile(info)
+        assert "which is " in refused(tmp_path / "d.tar")
+
+
+def test_bombs(tmp_path):
+    """Zeros that are more than any image; nothing is unpacked to see that in a ZIP, and no more than the limit in a
+    compressed TAR."""
+    block = bytes(1 << 20)
+    with zipfile.ZipFile(tmp_path / "d.zip", "w", zipfile.ZIP_DEFLATED) as file, file.open("a.tif", "w") as member:
+        for _ in range((SMALL_BYTES >> 20) + 2):
+            member.write(block)
+    assert "as no image does" in refused(tmp_path / "d.zip")
+    # Many members, each of them small enough, that share their bytes.
+    archive_with(tmp_path / "s.zip", "a.tif", block)
+    content = bytearray((tmp_path / "s.zip").read_bytes())
+    at = content.index(b"PK\x01\x02")
+    entry, end = content[at : content.index(b"PK\x05\x06")], content[content.index(b"PK\x05\x06") :]
+    entries = b"".join(bytes(entry).replace(b"a.tif", b"%05d" % number) for number in range(100))
+    struct.pack_into("<HHL", end, 8, 100, 100, len(entries))
+    (tmp_path / "s.zip").write_bytes(bytes(content[:at]) + entries + bytes(end))
+    assert "are those of another file" in refused(tmp_path / "s.zip")
+
+
+def test_damaged_archives(tmp_path):
+    (tmp_path / "d.zip").write_bytes(b"PK\x03\x04 no archive")
+    assert "cannot be read as an archive" in refused(tmp_path / "d.zip")
+    (tmp_path / "d.tgz").write_bytes(b"\x1f\x8b\x08\x00" + bytes(40))
+    assert "cannot be read as an archive" in refused(tmp_path / "d.tgz")
+    assert "cannot be read: No such file or directory" in refused(tmp_path / "none.zip")
+    with zipfile.ZipFile(tmp_path / "t.zip", "w") as file:
+        file.writestr("a.tif", b"1")
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            file.writestr("a.tif", b"2")
+    assert "holds 'a.tif' twice" in refused(tmp_path / "t.zip")
+    archive_with(tmp_path / "e.zip", "a.tif", b"1")
+    content = bytearray((tmp_path / "e.zip").read_bytes())
+    for signature, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(signature) + place] |= 1
+    (tmp_path / "e.zip").write_bytes(content)
+    assert "is encrypted" in refused(tmp_path / "e.zip")
+
+
+def test_an_archive_in_an_archive_is_not_opened(taken, tmp_path):
+    inner = zipped(dimap_delivery(tmp_path / "delivery", taken), tmp_path / "inner.zip")
+    with zipfile.ZipFile(tmp_path / "d.zip", "w") as file:
+        file.write(inner, "inner.zip")
+    assert "holds no image with a camera" in refused(tmp_path / "d.zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("../IMG.TIF", "does not lie below its folder"),
+        ("/etc/passwd", "does not lie below its folder"),
+        ("http://server/IMG.TIF", "does not lie below its folder"),
+        ("/vsicurl/http://server/IMG.TIF", "does not lie below its folder"),
+        ("IMG_none_R1C1.TIF", "which is missing"),
+    ],
+)
+def test_tiles_elsewhere_or_missing(taken, tmp_path, name, says):
+    root = dimap_delivery(tmp_path / "d", taken)
+    index = one(root, "DIM_*_P_*.XML")
+    changed(index, f'href="{one(index.parent, "IMG_*_R1C1.TIF").name}"', f'href="{name}"')
+    assert says in refused(root)
+    root = maxar_delivery(tmp_path / "m", taken)
+    index = one(root, "*.TIL")
+    changed(index, f'"{one(index.parent, "*R1C1*.TIF").name}"', f'"{name}"')
+    assert says in refused(root)
+
+
+def test_a_tile_that_is_a_link_out_of_the_delivery(taken, tmp_path):
+    root = dimap_delivery(tmp_path / "d", taken)
+    tile = one(root, "IMG_*_P_*_R1C1.TIF")
+    tile.rename(tmp_path / "elsewhere.TIF")
+    tile.symlink_to(tmp_path / "elsewhere.TIF")
+    assert "is a link that leaves its folder" in refused(root)
+
+
+def test_a_tile_that_is_a_list_of_other_files(taken, tmp_path):
+    root = dimap_delivery(tmp_path / "d", taken)
+    one(root, "IMG_*_P_*_R1C1.TIF").write_text('<VRTDataset rasterXSize="100" rasterYSize="70"></VRTDataset>')
+    assert "holds no pixels itself" in refused(root)
+
+
+def test_entities_in_xml(taken, tmp_path):
+    root = dimap_delivery(tmp_path / "d", taken)
+    changed(
+        one(root, "DIM_*_P_*.XML"), "<Dimap_Document>",
+        '<!DOCTYPE d [<!ENTITY a SYSTEM "file:///etc/passwd">]><Dimap_Document>',
+    )  # fmt: skip
+    assert "declares a document type" in refused(root)
+    root = maxar_delivery(tmp_path / "m", taken, isd="")
+    changed(one(root, "*.XML"), "<isd>", '<!DOCTYPE d [<!ENTITY a "aaaa">]><isd>')
+    assert "declares a document type" in refused(root)
+
+
+def test_tiles_that_overlap_or_leave_gaps(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "m", taken)
+    index = one(root, "*.TIL")
+    text = index.read_text()
+    index.write_text(
+        text.replace("ULColOffset = 100;", "ULColOffset = 99;").replace("LRColOffset = 147", "LRColOffset = 146")
+    )
+    assert "overlap" in refused(root)
+    index.write_text(
+        text.replace("ULRowOffset = 140;", "ULRowOffset = 141;").replace("LRRowOffset = 147", "LRRowOffset = 148")
+    )
+    assert "so some are missing" in refused(root)
+    index.write_text(text.replace("LRColOffset = 147", "LRColOffset = 160"))
+    assert "ends at row" in refused(root)
+    index.write_text(text.replace("ULColOffset = 100;", "ULColOffset = 1e3;"))
+    assert "not a whole number" in refused(root)
+    index.write_text(text.partition("END_GROUP = TILE_2")[0])
+    assert "stops within the group 'TILE_2'" in refused(root)
+    index.write_text("BEGIN_GROUP = IMAGE\nEND_GROUP = IMAGE\nEND;\n")
+    assert "names no file of pixels" in refused(root)
+
+
+def test_a_tile_of_other_pixels(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "m", taken)
+    write_image(one(root, "*R2C1*.TIF"), np.zeros((70, 100), np.uint8))
+    assert "has other bands or pixels than" in refused(root)
+
+
+def test_metadata_that_contradict_each_other(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "m", taken)
+    changed(one(root, "*P1BS*.IMD"), "numRows = 148;", "numRows = 149;")
+    assert "say that the image has 149 x 148 pixels" in refused(root)
+    changed(one(root, "*P1BS*.IMD"), "numRows = 149;", "numRows = 148;\nnumRows = 150;")
+    assert "gives 'numRows' twice, with different values" in refused(root)
+    root = dimap_delivery(tmp_path / "d", taken)
+    changed(one(root, "DIM_*_MS_*.XML"), "<NROWS>36</NROWS>", "<NROWS>38</NROWS>")
+    assert "say that the image has 38 x 37 pixels" in refused(root)
+    root = dimap_delivery(tmp_path / "e", taken)
+    one(root, "RPC_*_P_*.XML").unlink()
+    assert "Add the RPC_*.XML of the product" in refused(root)
+
+
+def test_parts_of_a_product_that_are_missing(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "m", taken)
+    one(root, "*M1BS*.TIF").unlink()
+    assert "Copy the whole product again" in refused(root)
+    root = maxar_delivery(tmp_path / "r", taken)
+    one(root, "*P1BS*.RPB").unlink()
+    assert ".RPB beside it. Add it" in refused(root)
+
+
+def test_ortho_images_are_named(taken, tmp_path):
+    root = dimap_delivery(tmp_path / "d", taken)
+    for index in root.rglob("DIM_*.XML"):
+        changed(index, "<RASTER_GEOMETRY>SENSOR", "<RASTER_GEOMETRY>GROUND")
+    assert "is an ortho-image, whose pixels have no camera: order the product as PRIMARY" in refused(root)
+
+
+@pytest.mark.parametrize(
+    ("href", "says"),
+    [
+        ("../../../secret.tif", "does not lie below"),
+        ("/etc/passwd", "does not lie below"),
+        ("https://server/pan.tif", "lies on a server, and is not fetched"),
+        ("./none.tif", "which is missing"),
+        ("", "is no path"),
+    ],
+)
+def test_assets_of_stac_elsewhere(taken, tmp_path, href, says):
+    catalogue = stac_delivery(tmp_path / "c", taken)
+    item = one(catalogue.parent, "item.json")
+    document = json.loads(item.read_text())
+    document["assets"]["pan"]["href"] = href
+    item.write_text(json.dumps(document))
+    assert says in refused(catalogue)
+    assert says in refused(catalogue.parent)
+
+
+def test_catalogues_that_lead_back_or_are_none(taken, tmp_path):
+    catalogue = stac_delivery(tmp_path / "c", taken)
+    document = json.loads(catalogue.read_text())
+    document["links"].append({"rel": "child", "href": "./catalog.json"})
+    catalogue.write_text(json.dumps(document))
+    assert len(open_delivery(catalogue).views) == 2
+    catalogue.write_text("{}")
+    assert "it does not say its stac_version" in refused(catalogue)
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ("image,day\nnadir.tif,2014-10-05\n", "is no table of dates"),
+        ("image,date\nnadir.tif,2014-10-05\nnadir.tif,2014-10-06\n", "line 3: 'nadir' is there twice"),
+        ("image,date\nnadir.tif,2014-13-05\n", "line 2: '2014-13-05' is no day"),
+        ("", "is no table of dates"),
+    ],
+)
+def test_tables_of_dates_that_are_none(taken, tmp_path, table, says):
+    write_single(tmp_path, taken[0])
+    (tmp_path / "dates.csv").write_text(table)
+    assert says in refused(tmp_path)
+
+
+def test_folders_too_deep_and_links_that_lead_back(taken, tmp_path):
+    for shot in taken:
+        write_single(tmp_path / "d" / "inner", shot)
+    (tmp_path / "d" / "inner" / "again").symlink_to(tmp_path / "d")
+    assert len(open_delivery(tmp_path / "d").views) == 2
+    (tmp_path.joinpath("d", *["a"] * 20)).mkdir(parents=True)
+    assert "deeper than deliveries go" in refused(tmp_path / "d")
