@@ -26,6 +26,7 @@ from zlocus.pipeline.messages import grave_doubt
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
+from zlocus.products.acquisitions import acquisition_records
 from zlocus.products.derived import link_all, write_derived
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES
@@ -144,13 +145,14 @@ def run_record(
 def _request_record(
     request: DsmRequest, config: RunConfig, scene: Scene, inputs: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Request, options, time, versions, input files, and when the images were taken."""
+    """Request, options, time, versions, input files, and when and how the images were taken."""
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         **origin_record(COMMANDS[DsmRequest], kernels_of_package()),
         "versions": versions_record(),
         "inputs": list(inputs),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
+        "acquisitions": acquisition_records(scene.views),
     }
 
 

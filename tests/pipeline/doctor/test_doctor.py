@@ -613,6 +613,7 @@ def test_suns_that_are_far_apart_are_told(good, tmp_path):
     (told,) = sentences(report, "note")
     assert re.match(r"The sun stood up to 61 degrees apart \(aft and nadir\): shadows", told)
     assert report["verdict"] == "good"
-    assert report["views"]["aft"]["sun_deg"] == [230.0, 30.0]
+    aft = report["views"]["aft"]
+    assert (aft["sun_azimuth_deg"], aft["sun_altitude_deg"]) == (230.0, 30.0)
     _, _, report = doctor(tmp_path / "out", paths["nadir"], paths["fore"])
     assert not sentences(report, "note")

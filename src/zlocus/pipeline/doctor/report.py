@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding
 from zlocus.pipeline.doctor.plan import ROUGHLY, RunPlan
 from zlocus.pipeline.doctor.quality import ImageQuality, percent
 from zlocus.pipeline.doctor.ties import QuickTies
+from zlocus.products.acquisitions import COLUMNS, acquisition_record, acquisition_records, acquisition_rows
 
 MOST_PAIRS = 30
 HEADINGS = {STOPS: "What will not work", POOR: "What may go wrong", NOTE: "Also"}
@@ -57,7 +58,14 @@ class Diagnosis:
         quick = (
             "" if self.ties is None or not self.ties.is_quick else "Ties are of a quick pass: a run finds more of them."
         )
-        parts = [_table("Images", _view_rows(self)), _table("Pairs", _pair_rows(self)), quick, *_plan_lines(self)]
+        taken = _table("How the images were taken", [COLUMNS, *acquisition_rows(acquisition_records(self.views))])
+        parts = [
+            _table("Images", _view_rows(self)),
+            taken,
+            _table("Pairs", _pair_rows(self)),
+            quick,
+            *_plan_lines(self),
+        ]
         sections = {
             heading: tuple(finding.sentence for finding in self.findings if finding.level == level)
             for level, heading in HEADINGS.items()
@@ -86,13 +94,11 @@ class Diagnosis:
     def view_record(self, number: int) -> dict[str, Any]:
         """The record of a view."""
         view, quality = self.views[number], self.quality[number]
-        sun = view.sun_direction
         record: dict[str, Any] = {
             "path": str(view.path),
             "sensor": kind_of(view.sensor),
             "shape": list(view.image.shape),
-            "date": None if view.date is None else view.date.isoformat(),
-            "sun_deg": None if sun is None else [sun.azimuth_deg, sun.altitude_deg],
+            **acquisition_record(view.acquisition),
         }
         if quality is not None:
             record |= {
@@ -211,7 +217,7 @@ def _plan_record(plan: RunPlan) -> dict[str, Any]:
     return record | {"shape": list(plan.shape), "heights": [_rounded(z) for z in plan.heights], "rough_factor": ROUGHLY}
 
 
-def _table(heading: str, rows: Iterator[Sequence[str]]) -> str:
+def _table(heading: str, rows: Iterable[Sequence[str]]) -> str:
     """A table as lines of text: rows under a heading, with aligned columns; no lines without a row."""
     cells = list(rows)
     if len(cells) < 2:

@@ -18,6 +18,7 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality
+from zlocus.products.acquisitions import COLUMNS, acquisition_rows
 from zlocus.products.match_curve_drawing import SVG_PX
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
@@ -119,7 +120,8 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
         "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
         "used": maps.views_map(survey), "reasons": words.reasons(survey), "reasons_map": maps.reasons_map(survey),
         "absent": words.listed([str(flag.name) for flag in Quality if not survey.count(flag)]),
-        "images": tables.image_rows(views), **pairs_part(out, run), "curves": curves_part(out / CURVES, run),
+        "images": tables.image_rows(views), "taken": acquisition_rows(run.get("acquisitions", {})),
+        "taken_columns": COLUMNS, **pairs_part(out, run), "curves": curves_part(out / CURVES, run),
         "reference": reference, "stages": tables.stage_rows(run["stages"]),
         "request": tables.request_rows(run["config"]["request"]),
         "options": tables.option_rows(run["config"]["options"]),
