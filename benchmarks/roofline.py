@@ -27,6 +27,8 @@ from threads import RUN_SECONDS, kernels_on_two, program_on_two
 
 SECONDS, FEWEST_RUNS = 1.5, 5
 ROUNDS = 2
+# So often the rates of the machine are measured again where a kernel seems to be faster than they allow.
+MORE_RATES = 5
 STEPS = 32
 # Tolerance for noise: a kernel that needs less than this share of its bound has a wrong count.
 TOLERANCE = 1.05
@@ -150,7 +152,7 @@ def show_kernels(machine: Machine, cases: dict[str, Case], reached_ns: dict[str,
         case, reached = cases[kernel.name], reached_ns[kernel.name]
         bounds = kernel.count.bounds_ns(machine, kernel.size)
         what, bound = max(bounds.items(), key=lambda item: item[1])
-        sound = sound and bound <= reached * TOLERANCE
+        sound = sound and is_within_bound(machine, kernel, reached)
         count = kernel.count
         moved = f"{count.loads + count.stores:.3g}, {count.memory:.2g}"
         print(
@@ -159,6 +161,11 @@ def show_kernels(machine: Machine, cases: dict[str, Case], reached_ns: dict[str,
             flush=True,
         )
     return sound
+
+
+def is_within_bound(machine: Machine, kernel: Kernel, reached_ns: float) -> bool:
+    """Whether a kernel is no faster than the machine allows."""
+    return max(kernel.count.bounds_ns(machine, kernel.size).values()) <= reached_ns * TOLERANCE
 
 
 def operations(count: Count) -> str:
@@ -184,6 +191,11 @@ def main() -> int:
     before, cases = measured(options.rates), {kernel.name: kernel.case() for kernel in chosen}
     reached_ns = {name: best_ns(case, options.seconds) for name, case in cases.items()}
     machine = before.or_better(measured(options.rates))
+    for _ in range(MORE_RATES):
+        # Another program may have slowed the rates down, and not the kernels.
+        if all(is_within_bound(machine, kernel, reached_ns[kernel.name]) for kernel in chosen):
+            break
+        machine = machine.or_better(measured(options.rates))
     show_machine(machine)
     sound = show_kernels(machine, cases, reached_ns)
     if options.threads:

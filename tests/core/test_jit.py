@@ -48,6 +48,13 @@ def test_a_change_in_any_source_gives_another_folder(sources):
     assert cache_folder(sources) in found
 
 
+def test_another_numba_has_a_folder_of_its_own(sources, monkeypatch):
+    """Two environments may share the sources, and the one cannot read the machine code of the other."""
+    found = cache_folder(sources)
+    monkeypatch.setattr("numba.__version__", "0.57.0")
+    assert cache_folder(sources) != found
+
+
 def test_where_the_sources_cannot_be_written_beside(sources, tmp_path, monkeypatch):
     """An installation of another user: the user's own cache (here a file stands in the folder's place)."""
     beside = cache_folder(sources)

@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numba
 from numba import config, njit
 
 from zlocus.core.errors import ZlocusWarning
@@ -31,19 +32,25 @@ KERNEL_FILES = (
 
 
 def cache_folder(package: Path) -> Path | None:
-    """The first folder that compiled kernels can be kept in, named by the content of their sources; None without any.
+    """The first folder that compiled kernels can be kept in; None without any.
 
     package : folder of the package. The cache lies in NUMBA_CACHE_DIR where that is set, else in the package, else in
     the user's own cache.
     """
-    digest = kernels_digest(package)
-    return next((place / digest for place in _places(package) if _takes_kernels(place, digest)), None)
+    name = _folder_name(package)
+    return next((place / name for place in _places(package) if _takes_kernels(place, name)), None)
 
 
 def kernels_digest(package: Path) -> str:
-    """Name of the cache folder for the kernels of a package: another content gives another name."""
+    """Checksum of the sources of all kernels of a package."""
     files = sorted({path for pattern in KERNEL_FILES for path in package.glob(pattern)})
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+
+
+def _folder_name(package: Path) -> str:
+    """Name of the cache folder: other sources of kernels give another one, and so does another Numba, because two
+    environments may share a package, and one cannot read the machine code of the other."""
+    return f"{kernels_digest(package)}-numba-{numba.__version__}"
 
 
 def _places(package: Path) -> Iterator[Path]:
@@ -57,11 +64,11 @@ def _places(package: Path) -> Iterator[Path]:
         return
 
 
-def _takes_kernels(place: Path, digest: str) -> bool:
+def _takes_kernels(place: Path, name: str) -> bool:
     """Whether files can be written to a folder, and to the folders that an earlier run made in it."""
     try:
         place.mkdir(parents=True, exist_ok=True)
-        kept = place / digest
+        kept = place / name
         for folder in (place, kept, *kept.glob("*/")):
             if folder.exists():
                 # Only an attempt tells for sure: permission bits say nothing of read-only disks.
@@ -92,7 +99,7 @@ class KernelCache:
         else:
             atexit.register(self._removed.cleanup)
             self.temporary = Path(self._removed.name)
-            self.folder = self.temporary / kernels_digest(package)
+            self.folder = self.temporary / _folder_name(package)
             instead = f"They are kept in {self.temporary} until this process ends."
         places = " or ".join(str(place) for place in _places(package))
         warnings.warn(
