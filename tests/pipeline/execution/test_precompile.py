@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
+import os
 import subprocess
 import sys
 
 import pytest
 
+from places import TESTS
 from zlocus.core.jit import COMPLETE, KernelCache
 from zlocus.core.progress import LineProgress
 from zlocus.pipeline.execution import precompile
@@ -60,6 +63,43 @@ def test_nothing_is_compiled_where_nothing_can_be_kept(cache, monkeypatch):
     assert not told(("0",), monkeypatch)
     cache.mark_complete()
     assert not cache.is_complete
+
+
+# What the kernels that a process has called so far were called with, by their names.
+CALLED = """
+import gc, json
+from zlocus.core.lazy_kernels import LazyKernel
+print(json.dumps(sorted(
+    f"{each.__module__}.{each.__name__}{signature}"
+    for each in gc.get_objects() if type(each) is LazyKernel and "dispatcher" in each.__dict__
+    for signature in each.dispatcher.overloads
+)))
+"""
+WARM = "from zlocus.pipeline.execution import precompile\nfor group in precompile.GROUPS: precompile.warm(group)\n"
+RUN = """
+import sys
+from pathlib import Path
+from rendered_scenes import run
+run(tuple(map(Path, sys.argv[2:])), Path(sys.argv[1]), heights=None, report=True, workers=1)
+"""
+
+
+def called(code, *arguments):
+    """The calls of kernels of a process that runs some code."""
+    done = subprocess.run(
+        [sys.executable, "-c", code + CALLED, *map(str, arguments)], capture_output=True, text=True, timeout=300,
+        env=os.environ | {"PYTHONPATH": str(TESTS / "support")},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_all_kernels_of_a_run_are_compiled_in_advance(images, tmp_path):
+    """Otherwise the first tile of each process takes ten times as long as the plan says."""
+    in_advance = called(WARM)
+    of_run = called(RUN, tmp_path / "out", *images("sine").inputs)
+    assert len(of_run) > 20
+    assert of_run <= in_advance
 
 
 def test_a_process_that_compiles_for_another_ends_well():

@@ -150,6 +150,34 @@ def warm_orientation(match_scene: MatchScene) -> None:
     above.image_from_ray(np.zeros((1, 3)))
 
 
+def warm_costs_of_heights() -> None:
+    """Run the kernels once that only tiles of more cells, views or products use than those of the tiny scene."""
+    from zlocus.core.options import SemiGlobalOptions
+    from zlocus.matching.height_lattice import HeightLattice
+    from zlocus.matching.kernels.plane_fitting import plane_heights
+    from zlocus.matching.kernels.prior_costs import CoarserCells, add_costs_beyond, add_costs_of_candidates
+    from zlocus.matching.kernels.shared_records import VisibleHeights
+    from zlocus.matching.occlusion import keep_enough_views
+    from zlocus.matching.prior_costs import COST_BEYOND_TIES, COST_OF_CANDIDATES, misfit
+    from zlocus.matching.semiglobal import aggregate
+    from zlocus.products.hillshade import hillshade
+    from zlocus.sensors.straighten_kernel import straighten
+
+    shape = (8, 8)
+    lattice = HeightLattice(0.0, 1.0, shape, 4, np.zeros((2, 2), np.int64), np.full((2, 2), 4, np.int64))
+    cost, cells, low = np.zeros(lattice.size, np.uint8), np.zeros(shape, np.float32), np.zeros((3, *shape), np.int32)
+    with_one = replace(SemiGlobalOptions(), predecessors=1)
+    misfit(cost, lattice, aggregate(cost, lattice, np.full((4, *shape), 8, np.uint16), 1.0, with_one))
+    add_costs_beyond(cost, lattice.layout, cells, cells, cells, COST_BEYOND_TIES)
+    coarser = np.zeros((1, *shape), np.int32)
+    add_costs_of_candidates(cost, lattice.layout, cells, coarser, CoarserCells(0, 0, 2), COST_OF_CANDIDATES)
+    keep_enough_views(VisibleHeights(low, low, low))
+    hillshade(cells, 1.0, 315.0, 45.0)
+    plane_heights(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(2), np.zeros(3), np.empty(1))
+    line, taps = np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
+    straighten(np.zeros((2, 4), np.float32), line, taps, line, taps, np.empty((1, 2), np.float32))
+
+
 def warm(group: str) -> None:
     """Run a group of kernels once: `orient` for the orientation, `match` for matching up to the heights of the finest
     level, `refine` for the stages after it and for those that read the matching costs.
@@ -170,6 +198,7 @@ def warm(group: str) -> None:
     scene, config = tiny_scene(), RunConfig()
     if group == "orient":
         warm_orientation(scene)
+        warm_costs_of_heights()
         return
     if group == "match":
         without = replace(config, refine=replace(config.refine, rounds=0))
