@@ -57,7 +57,7 @@ def completed(shell: str, words: str, number: int) -> str:
 
 
 def test_shells_complete_commands_and_options():
-    assert completed("bash", "zlocus do", 1).split() == ["doctor"]
+    assert completed("bash", "zlocus do", 1).split() == ["doctor", "docs"]
     assert "--products" in completed("bash", "zlocus dsm --pro", 2)
     assert "doctor" in completed("zsh", "zlocus do", 1)
     assert "doctor" in completed("fish", "zlocus do", 1)

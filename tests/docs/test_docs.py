@@ -30,6 +30,8 @@ from zlocus.products.stac_item import PRODUCTS
 def fate(flag: Quality) -> str:
     if flag in EMPTY:
         return "none"
+    if flag is Quality.IMAGE_EXCLUDED:
+        return "either"
     return "filled" if flag is Quality.FILLED else "kept"
 
 

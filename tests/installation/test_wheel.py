@@ -17,7 +17,8 @@ from places import ROOT
 from zlocus import __version__
 
 SOURCE = ROOT / "src" / "zlocus"
-BUILT_FROM = ("pyproject.toml", "README.md", "LICENSE")
+BUILT_FROM = ("pyproject.toml", "setup.py", "README.md", "LICENSE")
+PAGES = [path.relative_to(ROOT) for path in (ROOT / "docs").rglob("*.md")]
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check", "--no-input")
 
 
@@ -34,6 +35,9 @@ def wheel(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     for name in BUILT_FROM:
         shutil.copy(ROOT / name, folder)
+    for page in PAGES:
+        (folder / page).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / page, folder / page)
     shutil.copytree(SOURCE, folder / "src" / "zlocus", ignore=shutil.ignore_patterns("__pycache__"))
     run(sys.executable, *PIP, "wheel", ".", "--no-deps", "--no-build-isolation", "--no-index", "-w", "dist", cwd=folder)
     (built,) = (folder / "dist").iterdir()
@@ -48,7 +52,8 @@ def test_the_wheel_is_pure_python(wheel):
 
 
 def test_the_wheel_holds_what_the_package_reads(wheel):
-    """All files beside the sources of the clone (templates, the inspector's page, the mark of typed packages).
+    """All files beside the sources of the clone (templates, the inspector's page, the mark of typed packages), and the
+    pages of the documentation.
 
     Notes for programmers are left out.
     """
@@ -59,7 +64,9 @@ def test_the_wheel_holds_what_the_package_reads(wheel):
     assert {"zlocus/py.typed", "zlocus/__main__.py"} <= expected
     assert {Path(name).suffix for name in expected} >= {".py", ".jinja", ".js", ".html"}
     meta = f"zlocus-{__version__}.dist-info/"
-    assert {name for name in names if not name.startswith(meta)} == expected
+    pages = {f"zlocus/pages/{path.relative_to('docs').as_posix()}" for path in PAGES}
+    assert len(pages) > 40
+    assert {name for name in names if not name.startswith(meta)} == expected | pages
     assert f"{meta}licenses/LICENSE" in names
 
 

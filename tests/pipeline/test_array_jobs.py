@@ -25,6 +25,7 @@ from zlocus.core.errors import OutputError
 from zlocus.inspector.inspection import Inspection
 from zlocus.io.run_record import versions_record
 from zlocus.matching.quality import Quality
+from zlocus.pipeline.array_jobs import matching_of_tasks
 from zlocus.pipeline.array_plan import PLAN, VALUES, stored_plan
 from zlocus.pipeline.execution.checkpoint import FOLDER
 from zlocus.pipeline.finished_record import checksum
@@ -493,3 +494,15 @@ def test_a_full_disk_keeps_the_tiles(zl, out, monkeypatch):
 
     monkeypatch.setattr(zlocus.pipeline.array_jobs, "write_rasters", full)
     assert "The 4 finished tiles are kept" in sentence_of(zl("tiles", "assemble", out), 3)
+
+
+def test_the_time_of_tasks_is_that_while_any_of_them_worked():
+    """Three tiles at the same time, with a gap between two of them and the third."""
+    ends = ("2026-11-29T10:00:10.000+00:00", "2026-11-29T10:00:12.000+00:00", "2026-11-29T10:01:00.500+00:00")
+    tiles = [
+        {"event": "tile", "time": time, "wall_s": wall_s, "cpu_s": 3.0, "peak_mb": 100.0 + wall_s}
+        for time, wall_s in zip(ends, (10.0, 4.0, 0.5), strict=True)
+    ]
+    stage = matching_of_tasks([*tiles, {"event": "began", "time": ends[0]}])
+    assert stage == {"name": "match", "wall_s": 12.5, "cpu_s": 9.0, "peak_mb": 110.0}
+    assert matching_of_tasks([])["wall_s"] == 0.0

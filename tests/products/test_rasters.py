@@ -40,6 +40,15 @@ def test_blocks_land_in_their_place(tmp_path):
         assert ortho.read(1)[10, 20] == 5
 
 
+def test_the_flags_are_in_the_tags_of_their_band(tmp_path):
+    with SurfaceRasters(tmp_path, GRID, "uint16") as rasters:
+        rasters.write(10, 20, surface(8, 12))
+    with rasterio.open(tmp_path / "quality.tif") as quality:
+        tags = quality.tags(1)
+    values, names = (int(each) for each in tags["flag_masks"].split(", ")), tags["flag_meanings"].split()
+    assert dict(zip(names, values, strict=True)) == {flag.name: int(flag) for flag in Quality}
+
+
 def test_an_exception_leaves_nothing(tmp_path):
     with pytest.raises(ZeroDivisionError), SurfaceRasters(tmp_path, GRID, "uint8"):
         raise ZeroDivisionError

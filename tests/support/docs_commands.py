@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
 import camera_files
+import made_up_deliveries as deliveries
 from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
 from places import ROOT
@@ -148,9 +150,25 @@ def lay_out_drone(folder: Path) -> None:
     (folder / "reconstruction.json").write_text(json.dumps(project), encoding="utf-8")
 
 
+def lay_out_deliveries(folder: Path) -> None:
+    """What four vendors might send of two images: an archive, a folder, another archive, and a catalogue."""
+    images = rendered(folder / "rendered", "sine")
+    taken = deliveries.shots({name: images.paths[name] for name in ("nadir", "fore")})
+    deliveries.zipped(deliveries.dimap_delivery(folder / "delivery", taken), folder / "delivery.zip")
+    deliveries.maxar_delivery(folder / "first_strip", taken[:1])
+    with tarfile.open(folder / "second_strip.tar", "w") as archive:
+        archive.add(deliveries.maxar_delivery(folder / "second_strip", taken[1:]), "second_strip")
+    catalogue = deliveries.stac_delivery(folder / "catalogue", taken)
+    for path in catalogue.parent.iterdir():
+        path.rename(folder / path.name)
+
+
 def lay_out_readme(folder: Path) -> None:
-    """Three satellite images, a reference, and the project of a drone."""
+    """Three satellite images, a delivery, a reference, and the project of a drone."""
     lay_out_images(folder)
+    images = rendered(folder / "rendered", "sine")
+    taken = deliveries.shots({name: images.paths[name] for name in ("nadir", "fore")})
+    deliveries.zipped(deliveries.dimap_delivery(folder / "delivery", taken), folder / "delivery.zip")
     lay_out_drone(folder / "PROJECT")
 
 
@@ -245,6 +263,7 @@ LAID_OUT = {
     "docs/how-to/cloud.md": lay_out_images_and_area,
     "docs/how-to/compare.md": lay_out_images,
     "docs/how-to/curves.md": lay_out_images,
+    "docs/how-to/deliveries.md": lay_out_deliveries,
     "docs/how-to/doctor.md": lay_out_images,
     "docs/how-to/evaluate.md": lay_out_surfaces,
     "docs/how-to/import.md": lay_out_cameras,

@@ -20,6 +20,7 @@ from zlocus.cli.config import ConfigOptions, config
 from zlocus.cli.console import Console, OutputOptions
 from zlocus.cli.curves import CurvesOptions, curves
 from zlocus.cli.demo import DemoOptions, demo
+from zlocus.cli.docs import DocsOptions, docs
 from zlocus.cli.doctor import DoctorOptions, doctor
 from zlocus.cli.dsm import DsmOptions, dsm
 from zlocus.cli.evaluate import EvaluateOptions, evaluate
@@ -56,6 +57,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("report", ReportOptions, report),
     ("inspect", InspectOptions, inspect),
     ("config", ConfigOptions, config),
+    ("docs", DocsOptions, docs),
 )
 
 app = typer.Typer(

@@ -17,7 +17,9 @@ from zlocus.core.errors import OutputError
 class ConfigOptions:
     """Options of `zlocus config`."""
 
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="File to write. Without it, or with -, print.")] = None
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="File to write, in TOML. Without it, or with -, print.")
+    ] = None
 
 
 def config(options: ConfigOptions, console: Console) -> Answer:

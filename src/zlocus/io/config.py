@@ -22,7 +22,7 @@ from zlocus.io.safe_text import check_last_line_ended, read_text
 COMMENT_WIDTH = 100
 # A complete configuration has a tenth of this.
 MAX_CONFIG_BYTES = 200_000
-HEADING = "# Every option of zlocus. What is left out keeps its default; read with --config FILE."
+HEADING = "# Every option of zlocus, in TOML. What is left out keeps its default; read with --config FILE.toml."
 T = TypeVar("T")
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -55,7 +55,7 @@ class RasterBands:
     has_colours : the bands are red, green and blue.
     has_mask : an internal mask is written with the blocks (for images, in which every value is a valid grey value).
     average_overviews : overviews hold averages. None: averages for float cells and for rasters with a mask, the nearest
-    cell for all others (flags and counts).
+    cell for all others (flags and counts). tags : of each band, for other programs.
     """
 
     dtype: np.typing.DTypeLike
@@ -65,6 +65,7 @@ class RasterBands:
     has_colours: bool = False
     has_mask: bool = False
     average_overviews: bool | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def overview_resampling(self) -> str:
@@ -154,6 +155,8 @@ class RasterSink:
         with rasterio.open(self._part, "w", **self._profile) as dataset:
             for band, description in enumerate(descriptions, 1):
                 dataset.set_band_description(band, description)
+                if self._bands.tags:
+                    dataset.update_tags(band, **self._bands.tags)
             dataset.units = (self._bands.units,) * len(descriptions)
             statistics = [BandStatistics() for _ in descriptions]
             masks = iter(self._buffers[1]) if self._bands.has_mask else None

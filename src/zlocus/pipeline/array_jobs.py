@@ -7,8 +7,10 @@
 
 from __future__ import annotations
 
+import datetime
+import math
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -441,12 +443,25 @@ def _written(
 
 
 def matching_of_tasks(events: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The stage "match" of run.json from the events of all tasks: times of all tiles together, memory of the largest
-    process."""
+    """The stage "match" of run.json from the events of all tasks: the time while any of them worked, the CPU time of
+    all, and the memory of the largest process."""
     tiles = [event for event in events if event.get("event") in ("tile", "tile failed")]
     return {
         "name": "match",
-        "wall_s": round(sum(float(event.get("wall_s", 0.0)) for event in tiles), 3),
+        "wall_s": round(time_at_work_s(tiles), 3),
         "cpu_s": round(sum(float(event.get("cpu_s", 0.0)) for event in tiles), 3),
         "peak_mb": max((float(event.get("peak_mb", 0.0)) for event in tiles), default=0.0),
     }
+
+
+def time_at_work_s(events: Sequence[Mapping[str, Any]]) -> float:
+    """Seconds during which at least one of some events lasted. Each has the time of its end, and took `wall_s`."""
+    spans = []
+    for event in events:
+        end = datetime.datetime.fromisoformat(event["time"]).timestamp()
+        spans.append((end - float(event.get("wall_s", 0.0)), end))
+    total, until = 0.0, -math.inf
+    for begin, end in sorted(spans):
+        total += max(end - max(begin, until), 0.0)
+        until = max(until, end)
+    return total

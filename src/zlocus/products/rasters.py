@@ -13,6 +13,7 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
+from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
@@ -49,7 +50,7 @@ class SurfaceRasters:
             box = vertical.compound_geobox(geobox)
             self._dsm = sink("dsm.tif", "float32", above, box=box, nodata=float("nan"), units="m")
             self._sigma = sink("sigma.tif", "float32", "standard deviation of height", nodata=float("nan"), units="m")
-            self._quality = sink("quality.tif", "uint16", "quality bit flags")
+            self._quality = sink("quality.tif", "uint16", "quality bit flags", tags=flag_tags())
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
             self._ortho = sink("ortho.tif", self._ortho_dtype, *self._bands, has_colours=has_colours, has_mask=True)
             undo.pop_all()
@@ -89,3 +90,12 @@ def as_source(values: NDArray[np.float32], dtype: np.dtype[Any]) -> NDArray[Any]
         return values.astype(dtype)
     info = np.iinfo(dtype.name)
     return np.clip(np.rint(values), info.min, info.max).astype(dtype)
+
+
+def flag_tags() -> dict[str, str]:
+    """The flags of quality.tif as tags of its band, by the conventions of CF: their values and their names."""
+    flags = [flag for flag in Quality if flag.name]
+    return {
+        "flag_masks": ", ".join(str(int(flag)) for flag in flags),
+        "flag_meanings": " ".join(str(flag.name) for flag in flags),
+    }

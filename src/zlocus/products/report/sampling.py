@@ -14,7 +14,7 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
 from zlocus.io.open_raster import open_raster
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import EMPTY, Quality, is_empty
 
 RASTERS = ("dsm", "sigma", "quality", "views")
 MAX_SAMPLED_SIDE = 1500
@@ -74,10 +74,17 @@ class Survey:
         return self.n_heights - self.count(Quality.FILLED)
 
     def count(self, flag: Quality) -> int:
-        """Number of cells of the requested area that have a flag; for OUTSIDE, of the whole grid."""
-        which = np.arange(N_CODES)
+        """Number of cells of the requested area that have a flag; for OUTSIDE, of the whole grid.
+
+        A flag that only warns is counted where there is a height of which it could warn.
+        """
+        which = np.arange(N_CODES, dtype=np.uint16)
         has = (which & int(flag)) != 0
-        return int(self.codes[has if flag is Quality.OUTSIDE else has & ((which & int(Quality.OUTSIDE)) == 0)].sum())
+        if flag is not Quality.OUTSIDE:
+            has &= (which & int(Quality.OUTSIDE)) == 0
+        if flag not in EMPTY and flag is not Quality.IMAGE_EXCLUDED:
+            has &= ~is_empty(which)
+        return int(self.codes[has].sum())
 
     def count_without(self, quality: Quality) -> int:
         """Number of cells that have none of some flags. quality : the flags, combined."""

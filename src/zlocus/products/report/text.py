@@ -67,10 +67,11 @@ STAGES = {
     "open": "opening images and cameras",
     "orient": "finding tie points and correcting the cameras",
     "setup": "choosing the height range, grid and tiles",
-    "match": "matching and writing the rasters",
+    "match": "matching, and in one process writing the tiles",
     "points": "writing tie points and ranking",
     "curves": "footprints and match curves for this page",
     "record": "checksums of the inputs",
+    "write": "joining the tiles to rasters",
     "products": "hillshade and other products of the surface",
 }
 SIDES = ("top", "upper right", "right", "lower right", "bottom", "lower left", "left", "upper left")
@@ -80,9 +81,13 @@ MIN_SHOWN_SHARE = 0.0001
 
 @dataclass(frozen=True)
 class Reason:
-    """A row of the table of reasons. fate : whether such cells have a height; share : of the requested cells."""
+    """A row of the table of reasons.
+
+    value : of the flag in quality.tif; fate : whether such cells have a height; share : of the requested cells.
+    """
 
     name: str
+    value: int
     meaning: str
     fate: str
     advice: str
@@ -97,15 +102,18 @@ def reasons(survey: Survey) -> list[Reason]:
         n = survey.count(flag)
         if n:
             base = math.prod(survey.shape) if flag is Quality.OUTSIDE else survey.n_requested
-            row = Reason(str(flag.name), MEANINGS[flag], fate(flag), ADVICE.get(flag, ""), n, percent(n, base))
+            name, advice = str(flag.name), ADVICE.get(flag, "")
+            row = Reason(name, int(flag), MEANINGS[flag], fate(flag), advice, n, percent(n, base))
             rows.append((flag not in EMPTY, -n, row))
     return [row for _, _, row in sorted(rows, key=lambda each: each[:2])]
 
 
 def fate(flag: Quality) -> str:
-    """Whether cells with a flag have a height: `none`, `filled` or `kept`."""
+    """Whether cells with a flag have a height: `none`, `filled`, `kept`, or `either`."""
     if flag in EMPTY:
         return "none"
+    if flag is Quality.IMAGE_EXCLUDED:
+        return "either"
     return "filled" if flag is Quality.FILLED else "kept"
 
 
@@ -234,12 +242,13 @@ def what_is_missing(survey: Survey) -> str:
     why = [(survey.count(flag), MEANINGS[flag]) for flag in EMPTY if flag is not Quality.OUTSIDE]
     common = sorted((each for each in why if each[0]), key=lambda each: -each[0])[:2]
     reasons = "; ".join(f"{meaning} ({percent(n, survey.n_requested)})" for n, meaning in common)
-    return f"{percent(n_missing, survey.n_requested)} of the requested cells have no height, mostly because: {reasons}."
+    said = f"{percent(n_missing, survey.n_requested)} of the requested cells have no height, mostly because: {reasons}."
+    return f"{said} A cell may have both reasons." if len(common) > 1 else said
 
 
 def what_is_doubtful(survey: Survey) -> str:
     """Shares of cells with each warning, in a sentence."""
-    warnings = Quality.WEAK | Quality.AMBIGUOUS | Quality.DISPUTED
+    warnings = Quality.WEAK | Quality.AMBIGUOUS | Quality.DISPUTED | Quality.UNREFINED
     counts = sorted(((survey.count(flag), str(flag.name)) for flag in warnings), key=lambda each: -each[0])
     warned = [f"{name} ({percent(n, survey.n_requested)} of the requested cells)" for n, name in counts if n]
     return f"Heights to check before use carry a warning, explained below: {listed(warned)}." if warned else ""
