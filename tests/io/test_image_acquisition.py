@@ -8,7 +8,7 @@ import rasterio
 
 from rpc_fixtures import write_image
 from zlocus.core.scene import Acquisition, SunDirection
-from zlocus.io.image_acquisition import acquisition_from, acquisition_of
+from zlocus.io.image_acquisition import acquisition_from, acquisition_of, sun_altitude_deg
 from zlocus.io.images import open_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -130,3 +130,18 @@ def test_two_sources_complete_each_other():
     assert day.completed_by(other) == Acquisition(OCTOBER, EXPOSURE, "WV03", cloud_cover=0.1)
     # The time of another day does not go with the day.
     assert Acquisition(date=datetime.date(2016, 1, 1)).completed_by(other).time is None
+
+
+@pytest.mark.parametrize(
+    ("time", "lon", "lat", "altitude"),
+    [
+        # Equinox and solstices at noon, over the equator, a tropic and a polar circle.
+        (datetime.datetime(2024, 3, 20, 12, 7, tzinfo=datetime.UTC), 0.0, 0.0, 90.0),
+        (datetime.datetime(2024, 6, 20, 12, 2, tzinfo=datetime.UTC), 0.0, 23.44, 90.0),
+        (datetime.datetime(2024, 12, 21, 11, 58, tzinfo=datetime.UTC), 0.0, 66.56, 0.0),
+        # Jacksonville, as the vendor says it.
+        (EXPOSURE, -81.66, 30.35, 51.2),
+    ],
+)
+def test_where_the_sun_stood(time, lon, lat, altitude):
+    assert sun_altitude_deg(time, lon, lat) == pytest.approx(altitude, abs=0.6)

@@ -269,8 +269,11 @@ def write_udm2(path: Path, shape: tuple[int, int]) -> None:
     write_image(path, bands)
 
 
-def gaofen_delivery(root: Path, taken: list[Shot]) -> Path:
-    """GaoFen-2 scenes: PAN and MSS as .tiff, each with an .rpb and an .xml of its name."""
+def gaofen_delivery(root: Path, taken: list[Shot], zenith: float = 90 - SUN_ELEVATION) -> Path:
+    """GaoFen-2 scenes: PAN and MSS as .tiff, each with an .rpb and an .xml of its name.
+
+    zenith : what the XML calls the zenith angle of the sun.
+    """
     for shot in taken:
         scene = f"GF2_PMS1_E5.2_N47.4_{shot.time:%Y%m%d}_L1A{shot.name}"
         folder = root / scene
@@ -283,7 +286,9 @@ def gaofen_delivery(root: Path, taken: list[Shot]) -> Path:
                 f"""<?xml version="1.0" encoding="UTF-8"?>
 <ProductMetaData><SatelliteID>GF2</SatelliteID><SensorID>PMS1</SensorID>
 <ReceiveTime>{shot.time:%Y-%m-%d %H:%M:%S}</ReceiveTime><StartTime>{local:%Y-%m-%d %H:%M:%S}</StartTime>
-<SolarAzimuth>{SUN_AZIMUTH}</SolarAzimuth><SolarZenith>{90 - SUN_ELEVATION}</SolarZenith>
+<WidthInPixels>{pixels.shape[-1]}</WidthInPixels><HeightInPixels>{pixels.shape[-2]}</HeightInPixels>
+<SolarAzimuth>{SUN_AZIMUTH}</SolarAzimuth><SolarZenith>{zenith}</SolarZenith>
+<CenterLatitude>30.35</CenterLatitude><CenterLongitude>-81.66</CenterLongitude>
 <SatelliteAzimuth>{VIEW_AZIMUTH}</SatelliteAzimuth><SatelliteZenith>{90 - VIEW_ELEVATION}</SatelliteZenith>
 <CloudPercent>{100 * CLOUD}</CloudPercent></ProductMetaData>
 """

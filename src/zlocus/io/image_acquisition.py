@@ -85,6 +85,24 @@ def sun_direction(azimuth_deg: float | None, altitude_deg: float | None) -> SunD
     return SunDirection(azimuth_deg % 360.0, altitude_deg)
 
 
+def sun_altitude_deg(time: datetime.datetime, lon: float, lat: float) -> float:
+    """Altitude of the sun above the horizon at a place (degrees), to about half a degree, without refraction.
+
+    Source: Astronomical Almanac, low-precision formulas for the Sun.
+    """
+    days = (time - datetime.datetime(2000, 1, 1, 12, tzinfo=datetime.UTC)).total_seconds() / 86_400
+    anomaly = math.radians(357.528 + 0.985_600_3 * days)
+    ecliptic = math.radians(280.460 + 0.985_647_4 * days + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly))
+    tilt = math.radians(23.439)
+    ascension = math.atan2(math.cos(tilt) * math.sin(ecliptic), math.cos(ecliptic))
+    declination = math.asin(math.sin(tilt) * math.sin(ecliptic))
+    sidereal = math.radians(280.460_618 + 360.985_647_366 * days + lon)
+    latitude = math.radians(lat)
+    sine = math.sin(latitude) * math.sin(declination)
+    sine += math.cos(latitude) * math.cos(declination) * math.cos(sidereal - ascension)
+    return math.degrees(math.asin(sine))
+
+
 def time_in(text: str) -> tuple[datetime.date, datetime.datetime | None] | None:
     """Day and time (UTC) at the begin of a text, the time None where it only has a day; None where it holds no day on
     which an image can have been taken."""

@@ -93,6 +93,12 @@ def test_what_vendors_say_of_the_exposure(made, taken, vendor):
             assert said.incidence_deg == pytest.approx(90 - VIEW_ELEVATION)
 
 
+def test_an_altitude_that_is_called_a_zenith_angle_is_noticed(taken, tmp_path):
+    """Some products of this vendor do so. Here the sun stood 11 degrees higher than half-way, so both differ."""
+    for view in open_scene([gaofen_delivery(tmp_path / "d", taken, zenith=SUN_ELEVATION)]).views:
+        assert view.sun_direction == SunDirection(SUN_AZIMUTH, pytest.approx(SUN_ELEVATION))
+
+
 def smoothed(bands, axis):
     """A band after interpolation at four places of each pixel, 3/8 and 1/8 of a pixel from its centre to both sides,
     of which the two inner ones are averaged."""
