@@ -1,0 +1,73 @@
+"""From a delivery to its products: the heights of single files, in the colours of the multispectral images."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+from rasterio.enums import ColorInterp
+
+from made_up_deliveries import dimap_delivery, shots, write_single, zipped
+from rendered_scenes import read, run
+from zlocus.core.options import RunConfig
+from zlocus.core.progress import progress_for
+from zlocus.core.requests import CloudRequest
+from zlocus.core.rerun_request import RerunRequest
+from zlocus.pipeline.cloud import run_cloud
+from zlocus.pipeline.rerun import run_again
+
+
+@pytest.fixture(scope="module")
+def taken(images):
+    return shots({name: images("sine").paths[name] for name in ("nadir", "fore")})
+
+
+@pytest.fixture(scope="module")
+def archive(taken, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("archive")
+    return zipped(dimap_delivery(folder / "delivery", taken), folder / "d.zip", zipfile.ZIP_STORED)
+
+
+@pytest.fixture(scope="module")
+def surface(archive, tmp_path_factory):
+    return run((archive,), tmp_path_factory.mktemp("surface") / "out").out
+
+
+def test_the_heights_are_those_of_single_files(taken, surface, tmp_path):
+    single = run(tuple(write_single(tmp_path / "single", shot) for shot in taken), tmp_path / "out").out
+    for name in ("dsm.tif", "sigma.tif", "quality.tif", "views.tif"):
+        assert (surface / name).read_bytes() == (single / name).read_bytes(), name
+    record = json.loads((surface / "run.json").read_text())
+    assert [path["path"].rpartition("/")[2] for path in record["inputs"]] == ["d.zip"]
+    assert list(record["acquisitions"]) == ["PHR1A_20141005T160138", "PHR1A_20141005T160218"]
+    assert record["image_dates"] == ["2014-10-05"] * 2
+
+
+def test_the_ortho_image_has_the_colours(surface):
+    with rasterio.open(surface / "ortho.tif") as file:
+        assert file.colorinterp == (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+        bands, valid = file.read().astype(float), file.read_masks(1) > 0
+    # Each band is another multiple of the grey value: see the made-up delivery.
+    red, green, blue = (band[valid].mean() for band in bands)
+    assert green / red == pytest.approx(0.75, abs=0.01)
+    assert blue / red == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_cloud_has_the_colours(archive, tmp_path):
+    request = CloudRequest((archive,), tmp_path / "cloud", crs="EPSG:32632", references=("PHR1A_20141005T160138",))
+    run_cloud(request, RunConfig(), progress_for(io.StringIO()))
+    points = laspy.read(tmp_path / "cloud" / "cloud.laz")
+    ratio = np.median(points.green / points.red)
+    assert ratio == pytest.approx(0.75, abs=0.02)
+
+
+def test_the_run_is_repeated_from_its_record(surface, tmp_path):
+    run_again(RerunRequest(surface / "run.json", tmp_path / "again"), progress_for(io.StringIO()))
+    assert (surface / "dsm.tif").read_bytes() == (tmp_path / "again" / "dsm.tif").read_bytes()
+    heights, _ = read(surface / "dsm.tif")
+    assert np.isfinite(heights).mean() > 0.5
