@@ -25,7 +25,7 @@ CORRELATIONS = (-1.0, 1.05)
 MOST_TICKS = 8
 LEGEND_ROW_PX, LEGEND_LINE_PX = 15.0, 20.0
 # A legend of longer names has one column.
-LONGEST_NAME_IN_COLUMN = 22
+LONGEST_NAME_IN_COLUMN = 18
 FONT = "font-family='DejaVu Sans, Verdana, sans-serif'"
 
 

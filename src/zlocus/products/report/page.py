@@ -288,8 +288,10 @@ def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any
         return card
     point, n = cell["point"], cell["n_shown"]
     mean = point["means"][n - 1]
+    n_all = len(point["means"])
+    of = "The curve of the search image" if n_all == 1 else f"The mean of {n} of {n_all} search images"
     says = (
-        f"The mean of {n} of {len(point['means'])} search images with {point['reference']} is "
+        f"{of} with {point['reference']} is "
         f"{LABEL_WORDS[mean['label']]}: largest correlation {words.number(mean['rho1'])}, "
         f"{words.number(mean['ratio'])} times its secondary peak, at {words.number(mean['peak_m'], 'm')}."
     )
