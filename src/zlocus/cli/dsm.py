@@ -114,6 +114,25 @@ class DsmOptions:
             rich_help_panel=RESULT,
         ),
     ] = "none"
+    water: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write one level inside each of these polygons of water.", metavar="VECTOR", rich_help_panel=RESULT
+        ),
+    ] = None
+    water_level: Annotated[
+        str | None,
+        typer.Option(
+            help="Attribute of the polygons with the level, m in the vertical datum of the result. Default, and where "
+            "it is empty: found from the images.",
+            metavar="FIELD",
+            rich_help_panel=RESULT,
+        ),
+    ] = None
+    level_water: Annotated[
+        bool,
+        typer.Option("--level-water", help="Level possible water (3 in water.tif) too.", rich_help_panel=RESULT),
+    ] = False
     partial: Partial = False
     workers: Annotated[
         int | None,
@@ -152,6 +171,7 @@ def dsm_request(options: DsmOptions) -> DsmRequest:
         bounds=options.bounds, like=options.like, area=options.area, mask=options.mask, heights=options.heights,
         dem=options.dem, dem_vertical=options.dem_vertical, reference=options.reference, views=options.views,
         method=method_of(options), selection=options.selection, vertical=options.vertical, fill=options.fill,
+        water=options.water, water_level=options.water_level, level_water=options.level_water,
         partial=options.partial,
         workers=options.workers, scheduler=options.scheduler, memory_gb=options.memory, overwrite=options.overwrite,
         resume=options.resume, products=product_names(options.maps), report=options.report,

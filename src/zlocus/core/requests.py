@@ -47,6 +47,8 @@ class DsmRequest:
     inputs : two or more images with a camera, or one scene file.
     resolution : cell size, m. crs : grid's CRS. bounds : (xmin, ymin, xmax, ymax) in the grid's CRS, m.
     like : raster whose CRS, transform and shape are taken. area, mask : polygons to work in, and to leave out.
+    water : polygons of water surfaces, each of which gets one level; water_level : their attribute that holds it, None
+    finds it from the images. level_water : whether possible water is levelled too.
     heights : (zmin, zmax), m, in the vertical datum `vertical`. dem : raster around whose heights is searched;
     dem_vertical : its vertical datum, None takes the one of its CRS.
     reference : name of the reference image; with gc3-sgm only the pixels of this image are matched. selection : key of
@@ -86,6 +88,9 @@ class DsmRequest:
     selection: str = "default"
     vertical: str = "ellipsoid"
     fill: str = "none"
+    water: Path | None = None
+    water_level: str | None = None
+    level_water: bool = False
     partial: bool = False
     workers: int | None = None
     scheduler: str | None = None
@@ -121,6 +126,8 @@ class DsmRequest:
             )
         if self.fill == "dem" and self.dem is None:
             raise ConfigError("--fill dem needs the heights of a terrain model. Add --dem RASTER.")
+        if self.water_level is not None and self.water is None:
+            raise ConfigError(f"--water-level {self.water_level} is given without --water. Give both, or leave it out.")
         check_vertical("vertical", self.vertical)
         check_vertical_of("dem", self.dem, self.dem_vertical)
         check_workers(self.workers)
@@ -174,6 +181,7 @@ class SetupRequest:
     like: Path | None = None
     area: Path | None = None
     mask: Path | None = None
+    water: Path | None = None
     heights: tuple[float, float] | None = None
     dem: Path | None = None
     dem_vertical: str | None = None

@@ -44,6 +44,14 @@ class BlockBuffer:
             self._file.write(block.data.cast("B"))
         self._file.flush()
 
+    def get(self, row: int, col: int, shape: tuple[int, int]) -> NDArray[Any]:
+        """Cells (bands, r, c) of a part of the raster, whose first cell is (row, col). shape : its rows and columns."""
+        cells = np.empty((self._shape[0], *shape), self._block.dtype)
+        for r, c in product(self._blocks(row, shape[0]), self._blocks(col, shape[1])):
+            to, of = self._common(r, row, shape[0]), self._common(c, col, shape[1])
+            cells[:, to[1], of[1]] = self._read(r, c)[:, to[0], of[0]]
+        return cells
+
     def __iter__(self) -> Iterator[tuple[Slices, NDArray[Any]]]:
         """Yield rows and columns, and cells (bands, r, c), of each block that has cells. The array is reused."""
         for r, c in np.argwhere(self._place >= 0):

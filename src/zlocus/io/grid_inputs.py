@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS, Transformer
 from rasterio.enums import Resampling
 from rasterio.features import rasterize
+from rasterio.features import shapes as features_of
 from rasterio.warp import reproject, transform_bounds
 from rasterio.windows import Window
 
@@ -116,14 +118,40 @@ def lacks_vertical_datum(path: Path) -> bool:
     return vertical_part(crs) is None and len(crs.axis_info) < 3 and description != ELLIPSOIDAL_DESCRIPTION
 
 
+@dataclass(frozen=True)
+class Features:
+    """Polygons of a vector file with one of their attributes.
+
+    polygons : (n,) shapely polygons and multipolygons in a CRS; numbers : (n,) int64, place of each in the file, from
+    1; values : (n,) of the attribute as the file holds it; None where none was asked for.
+    """
+
+    polygons: NDArray[Any]
+    numbers: NDArray[np.int64]
+    values: NDArray[Any] | None
+
+
 def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...), converted to a CRS. (n,) shapely polygons.
 
     Raises
     ------
     InputError
+        See `read_features`.
+    """
+    return read_features(path, crs).polygons
+
+
+def read_features(path: Path, crs: CRS, field: str | None = None) -> Features:
+    """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...), converted to a CRS, with one attribute.
+
+    field : name of the attribute; None: of none.
+
+    Raises
+    ------
+    InputError
         The file is no vector file, refers to other files, is an archive, has several layers or no CRS, or holds
-        anything but polygons.
+        anything but polygons; or its polygons have no such attribute.
     """
     # Imported here, because it takes 0.1 to 0.3 s and only runs with polygons need it.
     import pyogrio.raw
@@ -138,12 +166,13 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             raise InputError(
                 f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
             )
-        if (kind := pyogrio.read_info(path)["driver"]) not in VECTOR_DRIVERS:
+        if (kind := (info := pyogrio.read_info(path))["driver"]) not in VECTOR_DRIVERS:
             raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
+        _check_field(path, field, [str(name) for name in info["fields"]])
         with warnings.catch_warnings():
             # The library warns of open rings and numbers that are not finite. Both are refused below.
             warnings.simplefilter("ignore", RuntimeWarning)
-            meta, _, wkb, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
+            meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=True)
             polygons = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
         why = (
@@ -154,11 +183,31 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
         raise InputError(
             f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
         ) from error
-    polygons = polygons[~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)]
+    is_there = ~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)
+    polygons, numbers = polygons[is_there], np.flatnonzero(is_there) + 1
     if not len(polygons) or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     if meta["crs"] is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
+    converted = _converted(polygons, path, file_crs(meta["crs"], path), crs)
+    return Features(converted, numbers, None if field is None else np.asarray(columns[0])[is_there])
+
+
+def _check_field(path: Path, field: str | None, known: list[str]) -> None:
+    """Refuse an attribute that the features of a file do not have."""
+    if field is not None and field not in known:
+        held = f"has {', '.join(known)}" if known else "has no attributes"
+        raise InputError(f"{path} {held}, and no attribute {field}. Check the name.")
+
+
+def _converted(polygons: NDArray[Any], path: Path, own_crs: CRS, crs: CRS) -> NDArray[Any]:
+    """Polygons (n,) of a file in another CRS, whose edges keep their course. own_crs : of the file.
+
+    Raises
+    ------
+    InputError
+        A coordinate is not finite, or the polygons have no area.
+    """
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused below
         west, south, east, north = shapely.total_bounds(polygons)
     largest = max(east - west, north - south)
@@ -167,7 +216,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
     polygons = shapely.segmentize(polygons, largest / MIN_PIECES_PER_EXTENT)
-    transformer = Transformer.from_crs(file_crs(meta["crs"], path).to_2d(), crs.to_2d(), always_xy=True)
+    transformer = Transformer.from_crs(own_crs.to_2d(), crs.to_2d(), always_xy=True)
     return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
 
 
@@ -175,6 +224,25 @@ def cells_inside(polygons: NDArray[Any], geobox: GeoBox) -> NDArray[np.bool_]:
     """Which cells have their centre inside a polygon, (r, c) bool. polygons : (n,) in the grid's CRS."""
     inside = rasterize(polygons, out_shape=tuple(geobox.shape), transform=geobox.transform, dtype="uint8")
     return np.asarray(inside, bool)
+
+
+def cells_of_each(polygons: NDArray[Any], numbers: NDArray[np.int64], geobox: GeoBox) -> NDArray[np.int32]:
+    """Number of the polygon that holds the centre of each cell, (r, c) int32; the last of several, 0 where none does.
+
+    polygons : (n,) in the grid's CRS; numbers : (n,) from 1.
+    """
+    shape = tuple(geobox.shape)
+    if not len(polygons):
+        return np.zeros(shape, np.int32)
+    shapes = zip(polygons, numbers.tolist(), strict=True)
+    return np.asarray(rasterize(shapes, out_shape=shape, transform=geobox.transform, dtype="int32"))
+
+
+def outline_of(is_inside: NDArray[np.bool_], geobox: GeoBox) -> Any:
+    """The polygon around connected cells, in the CRS of the grid. is_inside : (r, c) bool, at least one; geobox : of
+    these cells."""
+    ((outline, _),) = features_of(is_inside.astype(np.uint8), mask=is_inside, transform=geobox.transform)
+    return shapely.geometry.shape(outline)
 
 
 def _resampled(source: rasterio.DatasetReader, crs: CRS, geobox: GeoBox) -> NDArray[np.float32]:

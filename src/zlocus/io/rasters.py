@@ -128,6 +128,11 @@ class RasterSink:
             for buffer, values in zip(self._buffers, (cells, valid[np.newaxis]), strict=False):
                 buffer.put(row, col, values)
 
+    def read(self, row: int, col: int, shape: tuple[int, int]) -> NDArray[Any]:
+        """Cells (r, c) of the first band as they were written so far, from (row, col) on. shape : rows and columns."""
+        with self._lock, self._writing():
+            return np.asarray(self._buffers[0].get(row, col, shape)[0])
+
     def close(self) -> None:
         """Convert the cells to a COG and give it its name. Temporary files are removed, also after an exception."""
         options = COG_OPTIONS | {

@@ -9,7 +9,7 @@ from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.requests import DEMO_BEGUN, FINISHED
 
 RECORD = "run.json"
-SURFACE_RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+SURFACE_RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 # Of an interrupted run: its finished tiles.
 MANIFEST = Path("tiles") / "manifest.json"
 # Files by which the result of another command is known: what it is, and the command that makes it.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.matching.kernels.fill import interpolate_gaps
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import Quality, with_filled
 from zlocus.matching.surface import Surface
 
 
@@ -35,7 +35,7 @@ def filled_from(surface: Surface, terrain: NDArray[np.float32]) -> Surface:
 
 def _with_heights(surface: Surface, is_filled: NDArray[np.bool_], height: NDArray[np.float32]) -> Surface:
     """The surface with the given heights and the flag FILLED in filled cells."""
-    quality = np.where(is_filled, surface.quality | np.uint16(Quality.FILLED), surface.quality)
+    quality = with_filled(surface.quality, is_filled)
     return Surface(height, surface.sigma, quality, surface.views, surface.ortho)
 
 

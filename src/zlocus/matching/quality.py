@@ -27,12 +27,24 @@ class Quality(IntFlag):
     DISPUTED = 8192  # two groups of image pairs find different heights around the cell
     IMAGE_EXCLUDED = 16384  # an image that may show the cell was not used: it sees the cell too obliquely
     PLANE = 32768  # without texture of its own; the height is that of a plane fitted to the whole segment
+    # Both bits together, which no other cell has: water, whose height is the level of its whole surface.
+    WATER = FILLED | PLANE
 
 
 EMPTY = (
     Quality.OUTSIDE | Quality.UNSEEN | Quality.OCCLUDED | Quality.RANGE_END | Quality.NO_MATCH | Quality.FAILED
     | Quality.INCONSISTENT | Quality.IMPRECISE
 )  # fmt: skip
+
+
+def is_water(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """(r, c) bool: cells of water surfaces that were levelled, by their flags. quality : (r, c) uint16."""
+    return np.asarray((quality & np.uint16(Quality.WATER)) == np.uint16(Quality.WATER))
+
+
+def with_filled(quality: NDArray[np.uint16], is_filled: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """(r, c) uint16: flags of a surface whose gaps were filled. A filled cell has no plane of its own any more."""
+    return np.where(is_filled, (quality | np.uint16(Quality.FILLED)) & ~np.uint16(Quality.PLANE), quality)
 
 
 def is_empty(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:

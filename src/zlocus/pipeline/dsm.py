@@ -28,6 +28,7 @@ from zlocus.io.input_files import InputFiles
 from zlocus.io.rasters import compression_threads
 from zlocus.io.run_record import Stopwatch, read_record
 from zlocus.io.vertical import VerticalDatum
+from zlocus.io.water_polygons import WaterPolygons
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most, plan_tiles
@@ -54,8 +55,10 @@ from zlocus.pipeline.surface_products import (
 )
 from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
+from zlocus.pipeline.water import note_water, water_on_grid
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD
+from zlocus.products.water import level_water
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,8 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
 class PreparedSurface:
     """A surface whose tiles can be matched: everything that they and the products need.
 
-    inputs : files, with their states when the run began; tile_job : makes the tiles; digest : SHA-256 of the run setup.
+    inputs : files, with their states when the run began; tile_job : makes the tiles; digest : SHA-256 of the run setup;
+    water : polygons of water surfaces on the grid, None where none are given.
     """
 
     request: DsmRequest
@@ -156,6 +160,7 @@ class PreparedSurface:
     plan: Plan
     tile_job: TileJob
     digest: str
+    water: WaterPolygons | None = None
 
     @property
     def before(self) -> dict[str, NDArray[Any]]:
@@ -187,9 +192,10 @@ def prepare_surface(
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
+        water = None if run.water is None else water_on_grid(run.water, setup.grid.geobox, progress)
     job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
     return PreparedSurface(
-        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest
+        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, water
     )  # fmt: skip
 
 
@@ -200,16 +206,23 @@ def write_rasters(
     tally: Tally,
     progress: Progress,
 ) -> None:
-    """Write the rasters in place of an earlier run's products. failed_outcomes : of the tiles that stay empty.
+    """Write the rasters in place of an earlier run's products, and level water. failed_outcomes : of the tiles that
+    stay empty.
 
     Raises
     ------
     StoppedError
         A terrain model that fills gaps has changed, or a tile is damaged; no raster is written.
     """
-    remove_earlier_products(prepared_surface.request.out)
-    with surface_rasters(prepared_surface.request, prepared_surface.setup, prepared_surface.vertical_datum) as rasters:
+    request, setup = prepared_surface.request, prepared_surface.setup
+    remove_earlier_products(request.out)
+    with surface_rasters(request, setup, prepared_surface.vertical_datum) as rasters:
         tile_run.assemble(failed_outcomes, rasters, tally, progress)
+        water = level_water(
+            rasters, setup.grid.geobox, prepared_surface.water, request.level_water, prepared_surface.config.water
+        )
+        tally.add_water(water)
+        note_water(water, request, progress)
         # A terrain model that fills gaps was read again.
         prepared_surface.inputs.check(len(tile_run.checkpoint.finished))
 

@@ -22,7 +22,7 @@ from zlocus.products.tie_layers import write_ties
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
 
 # Products that only matching makes.
-MATCHED = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", RANKING, RECORD)
+MATCHED = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif", RANKING, RECORD)
 TIES = "ties.gpkg"
 # Products made from the tie points, which are kept or found again.
 OF_TIES = (TIES, OBSERVATIONS, FOOTPRINTS, CURVES)

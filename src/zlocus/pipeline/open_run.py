@@ -18,6 +18,7 @@ from zlocus.core.requests import FINISHED, CloudRequest, DsmRequest, SetupReques
 from zlocus.core.scene import Scene
 from zlocus.io.grid_inputs import cells_inside, read_polygons
 from zlocus.io.input_files import InputFiles
+from zlocus.io.water_polygons import WaterPolygons, read_water
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint
 from zlocus.pipeline.fingerprint import key_of
@@ -35,7 +36,7 @@ class OpenRun:
 
     opened_inputs : what the request names; inputs : all files, with their states when the run began; checkpoint :
     finished tiles; polygons : of the requested area; finished : the record of the same run, where it has finished
-    already, else None.
+    already, else None; water : polygons of water surfaces, None where none are given.
     """
 
     opened_inputs: OpenedInputs
@@ -43,6 +44,7 @@ class OpenRun:
     checkpoint: TileCheckpoint
     polygons: Polygons
     finished: Finished | None
+    water: WaterPolygons | None = None
 
 
 def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:
@@ -83,7 +85,7 @@ def _opened(
     key = key_of(request, config, inputs)
     checkpoint = TileCheckpoint.of(request.out, key, request.resume, request.overwrite, inputs.check)
     finished, polygons = finished_run(request, checkpoint), _area_polygons(setup_request, opened_inputs.scene.crs)
-    return OpenRun(opened_inputs, inputs, checkpoint, polygons, finished)
+    return OpenRun(opened_inputs, inputs, checkpoint, polygons, finished, _water_polygons(request, opened_inputs))
 
 
 def may_have_terrain(request: DsmRequest) -> bool:
@@ -96,6 +98,13 @@ def _area_polygons(request: SetupRequest, crs: CRS) -> Polygons:
     area = None if request.area is None else read_polygons(request.area, crs)
     mask = None if request.mask is None else read_polygons(request.mask, crs)
     return Polygons(area, mask)
+
+
+def _water_polygons(request: DsmRequest | CloudRequest, opened_inputs: OpenedInputs) -> WaterPolygons | None:
+    """Polygons of --water."""
+    if not isinstance(request, DsmRequest) or request.water is None:
+        return None
+    return read_water(request.water, opened_inputs.scene.crs, request.water_level)
 
 
 def _check_room_first(request: DsmRequest, opened_inputs: OpenedInputs, checkpoint: TileCheckpoint) -> None:

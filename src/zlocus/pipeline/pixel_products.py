@@ -16,7 +16,7 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.fill import filled_from_behind
 from zlocus.matching.image_space import ROWS_AT_ONCE
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import Quality, with_filled
 from zlocus.pipeline.image_tiles import MatchedPixels
 from zlocus.products.point_cloud import PointCloud, write_map
 from zlocus.sensors.image_rays import DepthRays
@@ -117,7 +117,7 @@ def write_maps(
     if fill == "interpolate":
         beyond = (quality & np.uint16(Quality.UNSEEN | Quality.OUTSIDE)) != 0
         whole = filled_from_behind(height, beyond)
-        quality = np.where(np.isnan(height) & np.isfinite(whole), quality | np.uint16(Quality.FILLED), quality)
+        quality = with_filled(quality, np.isnan(height) & np.isfinite(whole))
         height = whole
 
     def heights_m() -> Iterator[NDArray[np.float32]]:

@@ -16,7 +16,7 @@ from zlocus.io.config import config_from_dict
 from zlocus.io.stored_files import is_remote
 
 # Fields of a request that name files. --vertical and --dem-vertical may name files, too.
-FILES = ("like", "area", "mask", "dem")
+FILES = ("like", "area", "mask", "water", "dem")
 DATUMS = ("vertical", "dem_vertical")
 Request = TypeVar("Request", bound=DsmRequest | CloudRequest)
 

@@ -423,7 +423,7 @@ def _refuse_maps_in_local_frame(request: SetupRequest) -> None:
     GeometryError
         Such a file is given.
     """
-    for name in ("dem", "area", "mask"):
+    for name in ("dem", "area", "mask", "water"):
         if path := getattr(request, name):
             raise GeometryError(
                 f"The scene's frame is local, where {path} has no place. Leave --{name} out; --bounds and --heights "
@@ -433,7 +433,9 @@ def _refuse_maps_in_local_frame(request: SetupRequest) -> None:
 
 def _files_read(request: SetupRequest, scene: Scene, vertical_datum: VerticalDatum) -> list[Path]:
     """Every file whose content the result depends on, each once."""
-    extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
+    extra = [
+        path for path in (request.like, request.dem, request.area, request.mask, request.water) if path is not None
+    ]
     extra += vertical_datum.files
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files

@@ -35,7 +35,7 @@ from zlocus.products.tie_observations import write_observations
 
 # A surface with heights for a smaller share of the cells seen by two images is no success.
 SUFFICIENT_COVERAGE = 0.5
-RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 
 
 def has_colours(request: DsmRequest, setup: RunSetup) -> bool:

@@ -33,6 +33,7 @@ from zlocus.pipeline.execution.tasks import Failure, Here, Outcome, Workers, run
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup, reference_features
 from zlocus.products.rasters import SurfaceRasters
+from zlocus.products.water import WaterFound
 
 # A message names at most this many failed tiles.
 MAX_NAMED_TILES = 3
@@ -40,7 +41,10 @@ MAX_NAMED_TILES = 3
 
 @dataclass
 class Tally:
-    """Counts over the requested cells of all tiles. labelled_ties : labels of tie points, tile by tile."""
+    """Counts over the requested cells of all tiles.
+
+    labelled_ties : labels of tie points, tile by tile; water : water surfaces, once all tiles are written.
+    """
 
     n_seen: int = 0
     n_matched: int = 0
@@ -48,6 +52,7 @@ class Tally:
     evaluations: int = 0
     all_images: int = 0
     labelled_ties: list[LabelledTies] = field(default_factory=list)
+    water: WaterFound = field(default_factory=WaterFound)
 
     def add(self, tile_product: TileProduct) -> None:
         """Add the counts of a tile."""
@@ -62,9 +67,15 @@ class Tally:
         if tile_product.labelled_ties is not None:
             self.labelled_ties.append(tile_product.labelled_ties)
 
+    def add_water(self, water: WaterFound) -> None:
+        """Take levelled cells out of the counts: the images need not tell their height. Called after the last tile."""
+        self.n_seen -= water.n_seen
+        self.n_matched -= water.n_matched
+        self.water = water
+
     @property
     def coverage(self) -> float:
-        """Share of the cells seen by two images or more whose height was matched."""
+        """Share of the cells seen by two images or more, without levelled water, whose height was matched."""
         return self.n_matched / self.n_seen if self.n_seen else 0.0
 
     def as_dict(self) -> dict[str, Any]:
@@ -73,6 +84,7 @@ class Tally:
             "evaluations": {"done": self.evaluations, "all_images": self.all_images},
             "coverage": round(self.coverage, 6),
             "left_out_cells": self.n_left_out,
+            "water": self.water.as_dict(),
         }
 
 

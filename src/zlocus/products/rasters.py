@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,17 +15,35 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import EMPTY, Quality
 from zlocus.matching.surface import Surface
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 
 
+class Water(IntEnum):
+    """Values of `water.tif`."""
+
+    LAND = 0  # no water is known here
+    LEVELLED = 1  # inside a polygon of --water, with the level of its surface
+    POSSIBLE_LEVELLED = 2  # possible water, with the level of its surface (--level-water)
+    POSSIBLE = 3  # possible water, with its matched heights
+
+
+@dataclass(frozen=True)
+class WrittenHeights:
+    """height, sigma : (r, c) float32 m, in the vertical datum of the result; quality : (r, c) uint16, see `Quality`."""
+
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    quality: NDArray[np.uint16]
+
+
 class SurfaceRasters:
     """Writer of the rasters of a `Surface` on one grid. The files appear when the context ends without an error.
 
-    dsm.tif, sigma.tif, quality.tif, views.tif and ortho.tif. vertical : what the heights of dsm.tif are above; its CRS
-    says so, and those of the others, which hold no heights, are horizontal.
+    dsm.tif, sigma.tif, quality.tif, views.tif, ortho.tif and water.tif. vertical : what the heights of dsm.tif are
+    above; its CRS says so, and those of the others, which hold no heights, are horizontal.
     """
 
     def __init__(
@@ -53,6 +73,7 @@ class SurfaceRasters:
             self._quality = sink("quality.tif", "uint16", "quality bit flags", tags=flag_tags())
             self._views = sink("views.tif", "uint8", "images used", nodata=0)
             self._ortho = sink("ortho.tif", self._ortho_dtype, *self._bands, has_colours=has_colours, has_mask=True)
+            self._water = sink("water.tif", "uint8", "water surface")
             undo.pop_all()
 
     def write(self, row: int, col: int, surface: Surface) -> None:
@@ -67,6 +88,28 @@ class SurfaceRasters:
         self._ortho.write(
             row, col, as_source(np.broadcast_to(np.where(valid, bands, 0), shape), self._ortho_dtype), valid
         )
+
+    def heights(self, row: int, col: int, shape: tuple[int, int]) -> WrittenHeights:
+        """Heights of cells that are written, whose first is (row, col) of the grid. shape : rows and columns."""
+        return WrittenHeights(*(sink.read(row, col, shape) for sink in (self._dsm, self._sigma, self._quality)))
+
+    def level(self, row: int, col: int, is_levelled: NDArray[np.bool_], height_m: float, sigma_m: float) -> None:
+        """Give cells that are written the level of their water surface, and the flags that say so.
+
+        row, col : the first cell; is_levelled : (r, c) bool, those that get it; height_m : in the vertical datum of
+        dsm.tif; sigma_m : its standard deviation, NaN where it is not known.
+        """
+        shape = is_levelled.shape
+        why_empty = self._quality.read(row, col, shape) & np.uint16(EMPTY)
+        for sink, value in (
+            (self._dsm, np.float32(height_m)), (self._sigma, np.float32(sigma_m)), (self._views, np.uint8(0)),
+            (self._quality, why_empty | np.uint16(Quality.WATER)),
+        ):  # fmt: skip
+            sink.write(row, col, np.where(is_levelled, value, sink.read(row, col, shape)))
+
+    def mark_water(self, row: int, col: int, is_water: NDArray[np.bool_], kind: Water) -> None:
+        """Say in water.tif what kind of water cells are. row, col : the first cell; is_water : (r, c) bool."""
+        self._water.write(row, col, np.where(is_water, np.uint8(kind), self._water.read(row, col, is_water.shape)))
 
     def __enter__(self) -> SurfaceRasters:
         return self

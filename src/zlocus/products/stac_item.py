@@ -49,6 +49,7 @@ PRODUCTS = (
     Product("quality.tif", "Why a cell is empty or doubtful: bit flags", COG, ("data", "metadata")),
     Product("views.tif", "Number of images used", COG, ("data", "metadata")),
     Product("ortho.tif", "Ortho-image", COG, ("data", "visual")),
+    Product("water.tif", "Water: surfaces that were levelled, and possible water", COG, ("data", "metadata")),
     Product("hillshade.tif", "Hillshade of the surface", COG, ("visual", "overview")),
     Product("dtm.tif", "Terrain: the ground without buildings and trees", COG, ("data",)),
     Product("contours.gpkg", "Contours", GEOPACKAGE, ("data",)),

@@ -13,6 +13,7 @@ from zlocus.core.options.option_fields import Checked, option
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.synthetic.appearance import Changes
 from zlocus.synthetic.cameras import LineScanner, RectifiedScanner, SatelliteCamera, Shake, axes_of_heading
+from zlocus.synthetic.lakes import LAKES, with_lake
 from zlocus.synthetic.objects import Objects, add_objects
 from zlocus.synthetic.painting import TruthArea
 from zlocus.synthetic.realistic_ground import Cover, realistic_ground
@@ -120,7 +121,9 @@ class SceneSpec(Checked):
     views: tuple[ViewSpec, ...] = SATELLITE_VIEWS
     cover: Cover = field(default=Cover())
     changes: Changes = field(default=Changes())
-    trouble: str | None = option(None, "One trouble painted into a town; unset: none.", choices=tuple(TROUBLES))
+    trouble: str | None = option(
+        None, "One trouble or lake painted into a town; unset: none.", choices=(*TROUBLES, *LAKES)
+    )
     weather: tuple[Weather, ...] = ()
     west_m: float = option(462000.0, "Western border of the area, easting.", unit="m")
     north_m: float = option(5247000.0, "Northern border of the area, northing.", unit="m")
@@ -328,7 +331,10 @@ def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticG
     if spec.kind == "real":
         return realistic_ground(bare, spec.cover, truth_area, spec.seed)
     built = add_objects(bare, spec.objects, spec.seed)
-    return built if spec.trouble is None else with_trouble(built, spec.trouble, truth_area, spec.seed)
+    if spec.trouble is None:
+        return built
+    paint = with_lake if spec.trouble in LAKES else with_trouble
+    return paint(built, spec.trouble, truth_area, spec.seed)
 
 
 def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:

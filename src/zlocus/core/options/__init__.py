@@ -12,6 +12,7 @@ from zlocus.core.options.run_config import RunConfig
 from zlocus.core.options.search_options import PyramidOptions
 from zlocus.core.options.selection_options import SelectionOptions
 from zlocus.core.options.semiglobal_options import SemiGlobalOptions
+from zlocus.core.options.water_options import WaterOptions
 
 __all__ = [
     "BundleAdjustmentOptions",
@@ -25,5 +26,6 @@ __all__ = [
     "RunConfig",
     "SelectionOptions",
     "SemiGlobalOptions",
+    "WaterOptions",
     "large_window_side",
 ]

@@ -12,6 +12,7 @@ from zlocus.core.options.product_options import ProductOptions
 from zlocus.core.options.search_options import PyramidOptions
 from zlocus.core.options.selection_options import SelectionOptions
 from zlocus.core.options.semiglobal_options import SemiGlobalOptions
+from zlocus.core.options.water_options import WaterOptions
 
 
 @dataclass(frozen=True)
@@ -26,4 +27,5 @@ class RunConfig(Checked):
     refine: RefineOptions = group(RefineOptions, "Sub-step refinement.")
     planes: PlaneOptions = group(PlaneOptions, "Planes through plain segments.")
     checks: CheckOptions = group(CheckOptions, "Empty and doubtful cells.")
+    water: WaterOptions = group(WaterOptions, "Levels of water surfaces, and possible water.")
     products: ProductOptions = group(ProductOptions, "Maps made of the surface.")
