@@ -215,7 +215,8 @@ def test_every_argument_of_match_reaches_the_run(images, tmp_path, monkeypatch):
         "resolution": np.float32(0.5), "crs": CRS.from_epsg(32632), "bounds": np.array(PART), "area": "area.gpkg",
         "mask": tmp_path / "mask.gpkg", "dem": "dem.tif", "dem_vertical": tmp_path / "geoid.tif",
         "reference": "nadir", "views": "all", "method": "mvll", "selection": "default",
-        "vertical": tmp_path / "geoid.tif", "fill": "dem", "partial": True, "workers": np.int64(2),
+        "vertical": tmp_path / "geoid.tif", "fill": "dem", "water": "water.gpkg", "water_level": "level",
+        "level_water": True, "partial": True, "workers": np.int64(2),
         "scheduler": "tcp://host:8786", "memory_gb": 3, "overwrite": True, "resume": False, "products": ["laz"],
         "report": False, "out": tmp_path / "out",
     }  # fmt: skip
@@ -226,7 +227,7 @@ def test_every_argument_of_match_reaches_the_run(images, tmp_path, monkeypatch):
     expected = every | {
         "crs": "EPSG:32632", "bounds": PART, "area": Path("area.gpkg"), "dem": Path("dem.tif"),
         "dem_vertical": str(tmp_path / "geoid.tif"), "vertical": str(tmp_path / "geoid.tif"), "products": ("laz",),
-        "inputs": inputs, "like": None, "heights": None,
+        "inputs": inputs, "like": None, "heights": None, "water": Path("water.gpkg"),
     }  # fmt: skip
     assert vars(asked[0]) == expected
     assert (asked[1].like, asked[1].heights) == (Path("like.tif"), (20.0, 80.0))

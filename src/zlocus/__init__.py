@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         RunConfig,
         SelectionOptions,
         SemiGlobalOptions,
+        WaterOptions,
     )
     from zlocus.core.progress import BarProgress, LineProgress, SilentProgress
     from zlocus.core.scene import Scene
@@ -66,9 +67,9 @@ __all__ = [
     "Evaluation", "GeometryError", "InputError", "LineProgress", "LocusStack", "NotebookProgress", "Orientation",
     "OrientationOptions", "OutputError", "PlaneOptions", "ProductOptions", "PyramidOptions", "Quality",
     "RefineOptions", "RunConfig", "Scene", "SelectionOptions", "SemiGlobalHeights", "SemiGlobalOptions",
-    "SilentProgress", "StoppedError", "Ties", "TileError", "ZlocusError", "ZlocusWarning", "__version__", "evaluate",
-    "find_ties", "is_empty", "locus_stack", "match", "ncc_cost", "open_scene", "open_surface", "orient", "read_config",
-    "semiglobal", "true_ortho",
+    "SilentProgress", "StoppedError", "Ties", "TileError", "WaterOptions", "ZlocusError", "ZlocusWarning",
+    "__version__", "evaluate", "find_ties", "is_empty", "locus_stack", "match", "ncc_cost", "open_scene",
+    "open_surface", "orient", "read_config", "semiglobal", "true_ortho",
 ]  # fmt: skip
 # Modules from which names are taken when they are asked for; all other names are those of `zlocus.api`.
 _MODULES = {

@@ -157,8 +157,8 @@ def match(
 def open_surface(folder: PathLikes) -> xr.Dataset:
     """Open the result of `zlocus dsm` in a folder as a Dataset. `zlocus.open` is the same function.
 
-    Its variables are height and sigma (m), quality (bit flags), views and ortho, over y and x; the ortho-image of
-    colour images also over band (red, green, blue). A missing height is NaN. `zlocus.Quality` names the flags. Cells
+    Its variables are height and sigma (m), quality (bit flags), views, ortho and water, over y and x; the ortho-image
+    of colour images also over band (red, green, blue). A missing height is NaN. `zlocus.Quality` names the flags. Cells
     are read when they are needed. `surface.rio.crs` is the CRS. `surface.attrs` says what the surface is: crs,
     vertical_datum, resolution_m, method, source_images (one path a line), config (the request and all options, as
     JSON), options_sha256, source (the version), created, and run (the folder).

@@ -97,7 +97,7 @@ def test_a_run_stops_when_an_image_is_replaced(copied, elsewhere, tmp_path, monk
         asked(copied, out)
     shutil.move(elsewhere, copied[0])
     asked(copied, out)
-    for name in ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif"):
+    for name in ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif"):
         assert (out / name).read_bytes() == (straight / name).read_bytes()
 
 

@@ -277,3 +277,15 @@ def test_large_rasters_are_not_held_in_memory(tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 12e6  # bytes; the raster has 36e6
+
+
+def test_cells_are_read_before_the_raster_is_finished(tmp_path):
+    """Across blocks, and where nothing has been written yet; a part that is written again is the new one."""
+    cells = np.arange(600 * 700, dtype=np.float32).reshape(600, 700)
+    grid = GeoBox((600, 700), GRID.transform, GRID.crs)
+    with RasterSink(tmp_path / "a.tif", grid, RasterBands("float32", nodata=np.nan)) as sink:
+        sink.write(0, 0, cells[:550])
+        np.testing.assert_array_equal(sink.read(500, 480, (40, 60)), cells[500:540, 480:540])
+        assert np.isnan(sink.read(560, 0, (40, 700))).all()
+        sink.write(500, 480, -cells[500:540, 480:540])
+        np.testing.assert_array_equal(sink.read(500, 480, (40, 60)), -cells[500:540, 480:540])

@@ -67,3 +67,14 @@ def test_other_heights_fill_what_was_asked_for():
     unknown = filled_from(surface, none)
     np.testing.assert_array_equal(unknown.height, height)
     np.testing.assert_array_equal(unknown.quality, quality)
+
+
+def test_a_filled_cell_is_not_flagged_as_a_plane_too():
+    """Both flags together mean water."""
+    nothing = np.full((1, 3), np.nan, np.float32)
+    height = np.array([[1.0, np.nan, 1.0]], np.float32)
+    quality = np.array([[Quality.PLANE, Quality.PLANE | Quality.NO_MATCH, Quality.PLANE]], np.uint16)
+    surface = Surface(height, nothing, quality, np.ones((1, 3), np.uint8), nothing)
+    for closed in (filled(surface, 5), filled_from(surface, np.full((1, 3), 2.0, np.float32))):
+        expected = [Quality.PLANE, Quality.NO_MATCH | Quality.FILLED, Quality.PLANE]
+        np.testing.assert_array_equal(closed.quality[0], expected)

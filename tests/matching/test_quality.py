@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zlocus.matching.quality import EMPTY, Quality, is_empty
+from zlocus.matching.quality import EMPTY, Quality, flags_of, is_empty, is_water
 
 
 def test_bits_are_distinct_and_fit_the_raster():
@@ -17,3 +17,13 @@ def test_which_reasons_empty_a_cell():
                        Quality.FAILED, Quality.INCONSISTENT, Quality.IMPRECISE}  # fmt: skip
     filled = np.array([EMPTY | Quality.FILLED, Quality.WEAK, 0, EMPTY | Quality.WEAK], np.uint16)
     np.testing.assert_array_equal(is_empty(filled), [False, False, False, True])
+
+
+def test_water_is_two_bits_that_no_other_cell_has():
+    assert Quality.WATER == Quality.FILLED | Quality.PLANE
+    assert Quality.WATER not in list(Quality)
+    codes = np.array([Quality.WATER, Quality.WATER | Quality.UNSEEN, Quality.FILLED, Quality.PLANE, 0], np.uint16)
+    np.testing.assert_array_equal(is_water(codes), [True, True, False, False, False])
+    assert flags_of(int(Quality.WATER | Quality.UNSEEN)) == [Quality.UNSEEN, Quality.WATER]
+    assert flags_of(int(Quality.FILLED | Quality.NO_MATCH)) == [Quality.NO_MATCH, Quality.FILLED]
+    assert flags_of(0) == []

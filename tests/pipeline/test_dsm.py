@@ -41,7 +41,7 @@ from zlocus.io.cameras.rpc_text import rpc_from_fields
 from zlocus.matching.quality import Quality, is_empty
 
 REPORT_FILES = ("report.html", "footprints.geojson", "curves.json")
-PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 MAPS = ("hillshade.tif", "dtm.tif")
 ALL_MAPS = ("hillshade", "contours", "dtm", "laz")
 # Base-to-height about 0.6 and 0.5 m pixels: 0.05 m of height is 0.06 px.

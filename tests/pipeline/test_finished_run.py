@@ -34,7 +34,7 @@ from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
 from zlocus.products.stac_item import PRODUCTS
 
-RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 OF_TIES = ("ties.gpkg", "observations.npz", "footprints.geojson", "curves.json")
 
 

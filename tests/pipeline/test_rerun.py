@@ -17,7 +17,7 @@ from rendered_scenes import PART
 from zlocus.cli.app import app
 from zlocus.io.run_record import processor_name
 
-RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 OPTIONS = "[pyramid]\ntile = 80\n[selection]\nmax_images = 6\n"
 
 
@@ -71,7 +71,7 @@ def test_a_surface_is_made_again_with_the_same_bytes(zl, folder):
     assert made.exit_code == 0, made.output
     done = zl("rerun", "surface/run.json", "-o", "again")
     assert done.exit_code == 0, done.output
-    assert "All 5 rasters have the recorded bytes." in done.stdout
+    assert "All 6 rasters have the recorded bytes." in done.stdout
     first, again = folder / "surface", folder / "again"
     assert {path.name for path in first.iterdir()} == {path.name for path in again.iterdir()}
     for name in (*RASTERS, "surface.laz"):
@@ -138,7 +138,7 @@ def test_inputs_are_found_where_they_were_and_where_they_are(zl, folder, tmp_pat
     assert not Path("out").exists()
     done = zl("rerun", "run.json", "-o", "out", "--inputs", "archive")
     assert done.exit_code == 0, done.output
-    assert "All 5 rasters have the recorded bytes." in done.stdout
+    assert "All 6 rasters have the recorded bytes." in done.stdout
     assert "is no folder" in sentence_of(zl("rerun", "run.json", "-o", "other", "--inputs", "gone"))
     shutil.copy("run.json", "archive")
     assert zl("rerun", "archive/run.json", "-o", "beside").exit_code == 0, "the images lie beside the record"
@@ -182,7 +182,7 @@ def test_images_of_a_scene_file_and_a_geoid_are_checked(zl, folder, tmp_path, mo
     assert "is not there any more" in said
     done = zl("rerun", "surface", "-o", "again", "--inputs", "elsewhere")
     assert done.exit_code == 0, done.output
-    assert "All 5 rasters have the recorded bytes." in done.stdout
+    assert "All 6 rasters have the recorded bytes." in done.stdout
     write_geoid(project / "geoid.tif", posts + 1, from_origin(7.5, 48.5, 0.25, 0.25))
     assert "geoid.tif has changed since" in sentence_of(zl("rerun", "surface", "-o", "b", "--inputs", "elsewhere"))
     (project / "images" / "aft.tif").write_bytes(b"II*\0 other")
@@ -268,4 +268,4 @@ def test_a_run_with_a_shortcoming_ends_so_again(zl, folder, monkeypatch):
     assert made.exit_code == 3, made.output
     again = zl("rerun", "surface", "-o", "again")
     assert again.exit_code == 3, again.output
-    assert "All 5 rasters have the recorded bytes." in again.stderr
+    assert "All 6 rasters have the recorded bytes." in again.stderr

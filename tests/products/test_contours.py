@@ -12,7 +12,7 @@ from affine import Affine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
-from shapely import from_wkb, get_coordinates, is_closed, is_simple
+from shapely import box, from_wkb, get_coordinates, is_closed, is_simple
 
 import zlocus.products.contours as contours_module
 from zlocus.core.errors import ConfigError
@@ -212,3 +212,16 @@ def test_in_a_local_frame_lines_have_no_crs(tmp_path):
     meta, lines, _ = drawn(tmp_path, np.tile(np.arange(40.0), (3, 1)), 5.0, local_frame().to_wkt())
     assert meta["crs"] is None
     assert len(lines) == 8
+
+
+@pytest.mark.parametrize("level_m", [100.0, 100.3])
+def test_no_contour_crosses_a_levelled_lake(tmp_path, level_m):
+    """A contour at the very level of a lake goes around it, through its outermost cells."""
+    row, col = np.mgrid[:80, :90]
+    z = 97.0 + 0.08 * col + 0.02 * row
+    lake = np.s_[20:60, 30:70]
+    z[lake] = level_m
+    _, lines, _ = drawn(tmp_path, z, 0.5, min_contour_cells=0.0)
+    inner = box(WEST + 30.6 * CELL_M, NORTH - 59.4 * CELL_M, WEST + 69.4 * CELL_M, NORTH - 20.6 * CELL_M)
+    assert len(lines) > 10
+    assert not any(line.intersects(inner) for line in lines)

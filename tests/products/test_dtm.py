@@ -126,3 +126,19 @@ def test_reasons_of_another_grid_are_refused(town):
     with pytest.raises(InputError, match=r"quality.tif is not on the grid of .*dsm.tif"):
         made(folder)
     assert not (folder / "dtm.tif").exists()
+
+
+def test_levelled_water_is_ground_at_its_level(town):
+    """Below the ground around it, and flagged as only water is; filled cells beside it are no ground."""
+    folder, ground, z = town
+    lake, filled = np.s_[150:180, 20:60], np.s_[150:180, 60:63]
+    with rasterio.open(folder / "quality.tif") as file:
+        quality = file.read(1)
+    z[lake], quality[lake] = 45.5, Quality.WATER
+    z[filled], quality[filled] = 90.0, Quality.FILLED | Quality.NO_MATCH
+    quality[lake][:3] |= np.uint16(Quality.UNSEEN)
+    write_cog(folder / "dsm.tif", z, grid(), nodata=np.nan)
+    write_cog(folder / "quality.tif", quality, grid())
+    terrain = made(folder)
+    np.testing.assert_array_equal(terrain[lake], np.float32(45.5))
+    assert np.nanmax(terrain[filled]) < ground[filled].max() + 0.5

@@ -26,7 +26,7 @@ def surface(rows, cols):
 def test_blocks_land_in_their_place(tmp_path):
     with SurfaceRasters(tmp_path, GRID, "uint16") as rasters:
         rasters.write(10, 20, surface(8, 12))
-    names = ["dsm.tif", "ortho.tif", "quality.tif", "sigma.tif", "views.tif"]
+    names = ["dsm.tif", "ortho.tif", "quality.tif", "sigma.tif", "views.tif", "water.tif"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
     with rasterio.open(tmp_path / "sigma.tif") as sigma:
         np.testing.assert_array_equal(sigma.read(1)[10:18, 20:32], surface(8, 12).sigma)

@@ -45,7 +45,7 @@ FAR_FROM_TIES = replace(SMALL_BLOCKS, selection=SelectionOptions(radius_px=3.0, 
 WITHIN_M, ROAD, BUILDING = 1.0, 1, 2
 # Largest share of cells that the choice of images may leave empty.
 COVERAGE = 0.005
-PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif")
+PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from zlocus.inspector.folder import Patch, PatchValues, SurfaceFolder, read_patch
 from zlocus.inspector.reference import Reference
 from zlocus.io.open_raster import cached_raster
+from zlocus.matching.quality import flags_of
 from zlocus.products.demo_figure import error_map
 from zlocus.products.hillshade import hillshade
 from zlocus.products.report import maps
@@ -210,6 +211,5 @@ def reasons_of(code: int) -> list[Mapping[str, str]]:
     return [
         {"name": str(flag.name), "meaning": words.MEANINGS[flag], "fate": words.fate(flag),
          "advice": words.ADVICE.get(flag, "")}
-        for flag in words.MEANINGS
-        if code & flag
+        for flag in flags_of(code)
     ]  # fmt: skip

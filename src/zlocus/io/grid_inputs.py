@@ -119,7 +119,7 @@ def lacks_vertical_datum(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Features:
+class PolygonFeatures:
     """Polygons of a vector file with one of their attributes.
 
     polygons : (n,) shapely polygons and multipolygons in a CRS; numbers : (n,) int64, place of each in the file, from
@@ -142,7 +142,7 @@ def read_polygons(path: Path, crs: CRS) -> NDArray[Any]:
     return read_features(path, crs).polygons
 
 
-def read_features(path: Path, crs: CRS, field: str | None = None) -> Features:
+def read_features(path: Path, crs: CRS, field: str | None = None) -> PolygonFeatures:
     """The polygons of a vector file (GeoJSON, GeoPackage, Shapefile...), converted to a CRS, with one attribute.
 
     field : name of the attribute; None: of none.
@@ -190,7 +190,7 @@ def read_features(path: Path, crs: CRS, field: str | None = None) -> Features:
     if meta["crs"] is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
     converted = _converted(polygons, path, file_crs(meta["crs"], path), crs)
-    return Features(converted, numbers, None if field is None else np.asarray(columns[0])[is_there])
+    return PolygonFeatures(converted, numbers, None if field is None else np.asarray(columns[0])[is_there])
 
 
 def _check_field(path: Path, field: str | None, known: list[str]) -> None:

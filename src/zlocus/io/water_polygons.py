@@ -18,6 +18,8 @@ from zlocus.io.safe_text import decimal, quoted
 
 # No water on the Earth, above any datum in use, has a level beyond these, m.
 LEVELS_M = (-1000.0, 10000.0)
+# A Shapefile holds attributes, CRS and encoding in files of their own.
+SHAPEFILE_SUFFIXES = (".dbf", ".prj", ".cpg")
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,12 @@ def read_water(path: Path, crs: CRS, field: str | None) -> WaterPolygons:
         part = f", part {seen[feature]}" if n_parts[feature] > 1 else ""
         names.append(f"polygon {features.numbers[feature]}{part}")
     return WaterPolygons(path, parts, tuple(names), levels[of_feature])
+
+
+def files_of_water(path: Path) -> list[Path]:
+    """The files of a vector file on which levels depend: of a Shapefile also those beside it."""
+    beside = [path.with_suffix(suffix) for suffix in SHAPEFILE_SUFFIXES] if path.suffix.lower() == ".shp" else []
+    return [path, *(each for each in beside if each.is_file())]
 
 
 def _levels(path: Path, numbers: NDArray[np.int64], values: NDArray[Any], field: str | None) -> NDArray[np.float64]:

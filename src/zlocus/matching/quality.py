@@ -42,6 +42,13 @@ def is_water(quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
     return np.asarray((quality & np.uint16(Quality.WATER)) == np.uint16(Quality.WATER))
 
 
+def flags_of(code: int) -> list[Quality]:
+    """The flags in a value of quality.tif, WATER in place of its two bits."""
+    if (code & Quality.WATER) == Quality.WATER:
+        return [*(flag for flag in Quality if code & flag and not flag & Quality.WATER), Quality.WATER]
+    return [flag for flag in Quality if code & flag]
+
+
 def with_filled(quality: NDArray[np.uint16], is_filled: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """(r, c) uint16: flags of a surface whose gaps were filled. A filled cell has no plane of its own any more."""
     return np.where(is_filled, (quality | np.uint16(Quality.FILLED)) & ~np.uint16(Quality.PLANE), quality)

@@ -8,7 +8,7 @@ of them; `benchmarks/rows/water.py` measures it on rendered lakes with different
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -44,6 +44,11 @@ class WaterHeights:
     shore_sigma: NDArray[np.float32]
     beyond: NDArray[np.float32]
     beyond_sigma: NDArray[np.float32]
+
+    def of_land(self) -> WaterHeights:
+        """The heights without those on the water, where its outline is not known well."""
+        none = np.zeros(0, np.float32)
+        return replace(self, inside=none, shore=none, shore_sigma=none)
 
 
 @dataclass(frozen=True)

@@ -46,9 +46,14 @@ def plan_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DryR
         f"Surface: {rows} x {cols} cells of {scene.cell_size:g} m in {setup.scene.crs.name}, from {len(names)} of "
         f"{len(setup.scene.views)} images.",
         f"Heights: {low:.1f} to {high:.1f} m above the ellipsoid, in steps of {scene.height_step:.3g} m.",
-        *_end_of(surface.plan, run),
     ]
     values = {"grid": grid, "heights": heights, "images": names, **_plan_values(surface.plan, run)}
+    if surface.water_polygons is not None:
+        values["water_polygons"] = n_water = len(surface.water_polygons.names)
+        lines.append(
+            f"Water: {n_water} polygon{'s' if n_water > 1 else ''} of {surface.water_polygons.path} will be levelled."
+        )
+    lines += _end_of(surface.plan, run)
     return DryRun("\n".join(lines), values)
 
 

@@ -148,7 +148,7 @@ class PreparedSurface:
     """A surface whose tiles can be matched: everything that they and the products need.
 
     inputs : files, with their states when the run began; tile_job : makes the tiles; digest : SHA-256 of the run setup;
-    water : polygons of water surfaces on the grid, None where none are given.
+    water_polygons : of water surfaces on the grid, None where none are given.
     """
 
     request: DsmRequest
@@ -160,7 +160,7 @@ class PreparedSurface:
     plan: Plan
     tile_job: TileJob
     digest: str
-    water: WaterPolygons | None = None
+    water_polygons: WaterPolygons | None = None
 
     @property
     def before(self) -> dict[str, NDArray[Any]]:
@@ -192,10 +192,12 @@ def prepare_surface(
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
-        water = None if run.water is None else water_on_grid(run.water, setup.grid.geobox, progress)
+        water_polygons = (
+            None if run.water_polygons is None else water_on_grid(run.water_polygons, setup.grid.geobox, progress)
+        )
     job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
     return PreparedSurface(
-        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, water
+        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, water_polygons
     )  # fmt: skip
 
 
@@ -218,11 +220,12 @@ def write_rasters(
     remove_earlier_products(request.out)
     with surface_rasters(request, setup, prepared_surface.vertical_datum) as rasters:
         tile_run.assemble(failed_outcomes, rasters, tally, progress)
-        water = level_water(
-            rasters, setup.grid.geobox, prepared_surface.water, request.level_water, prepared_surface.config.water
-        )
-        tally.add_water(water)
-        note_water(water, request, progress)
+        water_found = level_water(
+            rasters, setup.grid.geobox, prepared_surface.water_polygons, request.level_water,
+            prepared_surface.config.water,
+        )  # fmt: skip
+        tally.add_water(water_found)
+        note_water(water_found, request, progress)
         # A terrain model that fills gaps was read again.
         prepared_surface.inputs.check(len(tile_run.checkpoint.finished))
 

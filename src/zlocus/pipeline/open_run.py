@@ -36,7 +36,7 @@ class OpenRun:
 
     opened_inputs : what the request names; inputs : all files, with their states when the run began; checkpoint :
     finished tiles; polygons : of the requested area; finished : the record of the same run, where it has finished
-    already, else None; water : polygons of water surfaces, None where none are given.
+    already, else None; water_polygons : of water surfaces, None where none are given.
     """
 
     opened_inputs: OpenedInputs
@@ -44,7 +44,7 @@ class OpenRun:
     checkpoint: TileCheckpoint
     polygons: Polygons
     finished: Finished | None
-    water: WaterPolygons | None = None
+    water_polygons: WaterPolygons | None = None
 
 
 def open_run(request: DsmRequest, config: RunConfig, progress: Progress) -> OpenRun:

@@ -48,6 +48,7 @@ from zlocus.io.grid_inputs import dem_datum, read_dem, read_geobox
 from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, named_vertical_datum
+from zlocus.io.water_polygons import files_of_water
 from zlocus.matching.ground_pixels import cell_side, check_resolution, ground_pixels, median_ground_pixel
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
@@ -433,10 +434,10 @@ def _refuse_maps_in_local_frame(request: SetupRequest) -> None:
 
 def _files_read(request: SetupRequest, scene: Scene, vertical_datum: VerticalDatum) -> list[Path]:
     """Every file whose content the result depends on, each once."""
-    extra = [
-        path for path in (request.like, request.dem, request.area, request.mask, request.water) if path is not None
-    ]
+    extra = [path for path in (request.like, request.dem, request.area, request.mask) if path is not None]
     extra += vertical_datum.files
+    if request.water is not None:
+        extra += files_of_water(request.water)
     if request.dem is not None:
         extra += dem_datum(request.dem, request.dem_vertical).files
     read = files_of(scene)

@@ -43,7 +43,7 @@ MAX_NAMED_TILES = 3
 class Tally:
     """Counts over the requested cells of all tiles.
 
-    labelled_ties : labels of tie points, tile by tile; water : water surfaces, once all tiles are written.
+    labelled_ties : labels of tie points, tile by tile; water_found : water surfaces, once all tiles are written.
     """
 
     n_seen: int = 0
@@ -52,7 +52,7 @@ class Tally:
     evaluations: int = 0
     all_images: int = 0
     labelled_ties: list[LabelledTies] = field(default_factory=list)
-    water: WaterFound = field(default_factory=WaterFound)
+    water_found: WaterFound = field(default_factory=WaterFound)
 
     def add(self, tile_product: TileProduct) -> None:
         """Add the counts of a tile."""
@@ -67,11 +67,11 @@ class Tally:
         if tile_product.labelled_ties is not None:
             self.labelled_ties.append(tile_product.labelled_ties)
 
-    def add_water(self, water: WaterFound) -> None:
+    def add_water(self, water_found: WaterFound) -> None:
         """Take levelled cells out of the counts: the images need not tell their height. Called after the last tile."""
-        self.n_seen -= water.n_seen
-        self.n_matched -= water.n_matched
-        self.water = water
+        self.n_seen -= water_found.n_seen
+        self.n_matched -= water_found.n_matched
+        self.water_found = water_found
 
     @property
     def coverage(self) -> float:
@@ -84,7 +84,7 @@ class Tally:
             "evaluations": {"done": self.evaluations, "all_images": self.all_images},
             "coverage": round(self.coverage, 6),
             "left_out_cells": self.n_left_out,
-            "water": self.water.as_dict(),
+            "water": self.water_found.as_dict(),
         }
 
 

@@ -19,7 +19,7 @@ MAX_NAMED = 3
 UNCERTAIN_M = 0.25
 
 
-def water_on_grid(water: WaterPolygons, geobox: GeoBox, progress: Progress) -> WaterPolygons:
+def water_on_grid(water_polygons: WaterPolygons, geobox: GeoBox, progress: Progress) -> WaterPolygons:
     """The water polygons that hold a cell of the grid; the others are said.
 
     Raises
@@ -27,31 +27,31 @@ def water_on_grid(water: WaterPolygons, geobox: GeoBox, progress: Progress) -> W
     InputError
         None of them does.
     """
-    beside = without_cells(water, geobox)
-    if len(beside) == len(water.names):
+    beside = without_cells(water_polygons, geobox)
+    if len(beside) == len(water_polygons.names):
         xmin, ymin, xmax, ymax = geobox.boundingbox.bbox
         raise InputError(
-            f"No water polygon of {water.path} holds a cell of the grid (E {xmin:.0f} to {xmax:.0f} m, N {ymin:.0f} to "
-            f"{ymax:.0f} m). Check the polygons and their CRS."
+            f"No water polygon of {water_polygons.path} holds a cell of the grid (E {xmin:.0f} to {xmax:.0f} m, N "
+            f"{ymin:.0f} to {ymax:.0f} m). Check the polygons and their CRS."
         )
     if beside:
-        progress.note(f"Outside the grid, and without effect, lies of {water.path}: {_named(beside)}.")
-    return water.only(np.isin(water.names, beside, invert=True))
+        progress.note(f"Outside the grid, and without effect, lies of {water_polygons.path}: {_named(beside)}.")
+    return water_polygons.only(np.isin(water_polygons.names, beside, invert=True))
 
 
-def note_water(water: WaterFound, request: DsmRequest, progress: Progress) -> None:
+def note_water(water_found: WaterFound, request: DsmRequest, progress: Progress) -> None:
     """Say which water surfaces were levelled, which keep their heights, and which levels are uncertain."""
-    if water.levelled:
-        said = [f"{each.name} at {each.level.height_m:.2f} m" for each in water.levelled]
+    if water_found.levelled_surfaces:
+        said = [f"{each.name} at {each.level.height_m:.2f} m" for each in water_found.levelled_surfaces]
         progress.note(f"Water levelled: {_named(said)}.")
-    if water.left:
+    if water_found.left:
         progress.note(
-            f"Too few heights at the shore tell the level of {_named(water.left)}, which keeps its matched heights. "
-            "Give its level by --water-level."
+            f"Too few heights at the shore tell the level of {_named(water_found.left)}, and the matched heights stay "
+            "there. Give levels by --water-level."
         )
     uncertain = [
         f"{each.name} (by {each.level.sigma_m:.1f} m)"
-        for each in water.levelled
+        for each in water_found.levelled_surfaces
         if each.level.sigma_m > UNCERTAIN_M  # NaN where it was given
     ]
     if uncertain:
@@ -59,10 +59,10 @@ def note_water(water: WaterFound, request: DsmRequest, progress: Progress) -> No
             f"The ground rises steeply from the water, whose level may be too high: {_named(uncertain)}. Give the "
             "level by --water-level where it is known."
         )
-    if water.n_possible and not request.level_water:
+    if water_found.n_possible and not request.level_water:
         progress.note(
-            f"Possible water in {water.n_possible} area{'s' if water.n_possible > 1 else ''} (3 in water.tif): the "
-            "images agree at no height there. --water or --level-water levels it."
+            f"Possible water in {water_found.n_possible} area{'s' if water_found.n_possible > 1 else ''} (3 in "
+            "water.tif): the images agree at no height there. --water or --level-water levels it."
         )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from zlocus.core.options import ProductOptions
 from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.row_strips import STRIP_ROWS, BandReader, Strip, check_same_grid, strips_of
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import Quality, is_water
 from zlocus.products.smrf import between_blocks, block_mean, block_min, membrane, outside_of, terrain
 
 FloatImage = NDArray[np.float32]
@@ -28,8 +28,9 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
     """Write the terrain, float32 m: the surface where it is ground, else heights interpolated between ground.
 
     A cell is ground where its height is close to the provisional terrain of `smrf.terrain` and it is not flagged JUMP,
-    DISPUTED or FILLED. Cells stay empty where fewer than two images cover them, outside the requested area, and farther
-    than `ground_window_m` from all ground. strip_rows : rows that are processed at a time, about; they change no byte.
+    DISPUTED or FILLED; levelled water is ground. Other cells stay empty where fewer than two images cover them, outside
+    the requested area, and farther than `ground_window_m` from all ground. strip_rows : rows that are processed at a
+    time, about; they change no byte.
 
     Raises
     ------
@@ -56,8 +57,9 @@ def write_dtm(dsm: Path, quality: Path, path: Path, options: ProductOptions, str
                     slope, side, strip.row, z.shape
                 )
                 off = np.abs(z - between_blocks(first, side, strip.row, z.shape))
-                doubtful = (flag_reader.read(strip) & DOUBTFUL) != 0
-                yield strip, np.where((off <= allowed) & ~doubtful, z, np.float32(np.nan))
+                quality = flag_reader.read(strip)
+                is_ground = (off <= allowed) & ((quality & DOUBTFUL) == 0) | is_water(quality)
+                yield strip, np.where(is_ground, z, np.float32(np.nan))
 
         mean = np.concatenate([block_mean(ground, side) for _, ground in grounds()])
         filled, reach = membrane(mean), options.ground_window_m / (side * height_reader.cell_m)

@@ -21,13 +21,13 @@ from zlocus.matching.surface import Surface
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 
 
-class Water(IntEnum):
+class WaterKind(IntEnum):
     """Values of `water.tif`."""
 
     LAND = 0  # no water is known here
-    LEVELLED = 1  # inside a polygon of --water, with the level of its surface
-    POSSIBLE_LEVELLED = 2  # possible water, with the level of its surface (--level-water)
-    POSSIBLE = 3  # possible water, with its matched heights
+    LEVELLED = 1  # water inside a polygon, with the level of its surface
+    POSSIBLE_LEVELLED = 2  # possible water, with the level of its surface
+    POSSIBLE = 3  # possible water, or a polygon whose level is not known; the heights are the matched ones
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,11 @@ class SurfaceRasters:
         ):  # fmt: skip
             sink.write(row, col, np.where(is_levelled, value, sink.read(row, col, shape)))
 
-    def mark_water(self, row: int, col: int, is_water: NDArray[np.bool_], kind: Water) -> None:
+    def mark_water(self, row: int, col: int, is_water: NDArray[np.bool_], water_kind: WaterKind) -> None:
         """Say in water.tif what kind of water cells are. row, col : the first cell; is_water : (r, c) bool."""
-        self._water.write(row, col, np.where(is_water, np.uint8(kind), self._water.read(row, col, is_water.shape)))
+        self._water.write(
+            row, col, np.where(is_water, np.uint8(water_kind), self._water.read(row, col, is_water.shape))
+        )
 
     def __enter__(self) -> SurfaceRasters:
         return self

@@ -16,6 +16,7 @@ from zlocus.core.scene import is_local
 from zlocus.io.run_folder import RECORD, check_surface
 from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality
+from zlocus.products.rasters import WaterKind
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,6 +28,7 @@ VARIABLES = {
     "quality": ("quality.tif", "reasons why a height is missing or doubtful", "1"),
     "views": ("views.tif", "number of images used", "1"),
     "ortho": ("ortho.tif", "grey value or colours of the view that shows the cell best", "1"),
+    "water": ("water.tif", "water surface, levelled or possible", "1"),
 }
 COLOURS = ("red", "green", "blue")
 # Entries of run.json that are used.
@@ -78,6 +80,10 @@ def surface_dataset(folder: Path, keeps_folder: bool = True) -> xr.Dataset:
     found["quality"].attrs |= {
         "flag_masks": [int(flag) for flag in flags],
         "flag_meanings": " ".join(str(flag.name) for flag in flags),
+    }
+    found["water"].attrs |= {
+        "flag_values": [int(kind) for kind in WaterKind],
+        "flag_meanings": " ".join(kind.name for kind in WaterKind),
     }
     surface = xr.Dataset(found, attrs=_attributes(folder if keeps_folder else None, run))
     for axis in ("x", "y"):

@@ -20,9 +20,9 @@ from zlocus.core.options import WaterOptions
 from zlocus.io.grid_inputs import cells_of_each, outline_of
 from zlocus.io.water_polygons import WaterPolygons
 from zlocus.matching.possible_water import WaterBlocks, possible_water
-from zlocus.matching.quality import Quality, is_empty
+from zlocus.matching.quality import Quality
 from zlocus.matching.water_level import WaterHeights, WaterLevel, is_confident, shore_cells, water_level
-from zlocus.products.rasters import SurfaceRasters, Water
+from zlocus.products.rasters import SurfaceRasters, WaterKind
 
 # Rows that are worked on at a time.
 STRIP_ROWS = 128
@@ -34,18 +34,18 @@ NOT_LEVELLED = np.uint16(Quality.OUTSIDE | Quality.FAILED)
 
 
 @dataclass(frozen=True)
-class LevelledWater:
-    """A water surface that was levelled. name : as messages call it; kind : of its cells; n_cells : their number."""
+class LevelledSurface:
+    """A water surface that was levelled. name : as messages call it; water_kind : of its cells; n_cells : of them."""
 
     name: str
-    kind: Water
+    water_kind: WaterKind
     level: WaterLevel
     n_cells: int
 
     def as_dict(self) -> dict[str, Any]:
         """The surface as run.json holds it."""
         return {
-            "name": self.name, "kind": self.kind.name.lower(), "level_m": self.level.height_m,
+            "name": self.name, "kind": self.water_kind.name.lower(), "level_m": self.level.height_m,
             "sigma_m": self.level.sigma_m, "source": self.level.source, "n_cells": self.n_cells,
             "n_used": self.level.n_used,
         }  # fmt: skip
@@ -55,12 +55,12 @@ class LevelledWater:
 class WaterFound:
     """Water surfaces of a surface.
 
-    levelled : those that have a level now; left : names of those that keep their heights, because too few tell a level;
-    n_possible : number of areas of possible water. n_seen, n_matched : number of levelled cells that two images see,
-    and of those whose height was matched.
+    levelled_surfaces : those that have a level now; left : names of those that keep their heights, because too few tell
+    a level; n_possible : number of areas of possible water. n_seen, n_matched : number of levelled cells that two
+    images see, and of those whose height was matched.
     """
 
-    levelled: list[LevelledWater] = field(default_factory=list)
+    levelled_surfaces: list[LevelledSurface] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
     n_possible: int = 0
     n_seen: int = 0
@@ -69,7 +69,8 @@ class WaterFound:
     def as_dict(self) -> dict[str, Any]:
         """The surfaces as run.json holds them."""
         return {
-            "levelled": [each.as_dict() for each in self.levelled], "left": self.left, "possible": self.n_possible,
+            "levelled": [each.as_dict() for each in self.levelled_surfaces], "left": self.left,
+            "possible": self.n_possible,
         }  # fmt: skip
 
 
@@ -122,59 +123,90 @@ class WaterCells:
         return any(part.is_surface.any() for part in self.parts(number))
 
 
+@dataclass(frozen=True)
+class _Surface:
+    """A water surface that may be levelled. water_kind : LEVELLED or POSSIBLE; level_m : NaN where it is not given."""
+
+    name: str
+    polygon: Any
+    water_kind: WaterKind
+    level_m: float = math.nan
+
+
 def level_water(
-    rasters: SurfaceRasters, geobox: GeoBox, water: WaterPolygons | None, level_possible: bool, options: WaterOptions
+    rasters: SurfaceRasters,
+    geobox: GeoBox,
+    water_polygons: WaterPolygons | None,
+    level_possible: bool,
+    options: WaterOptions,
 ) -> WaterFound:
     """Level the water surfaces of rasters to which all tiles are written, and mark water in water.tif.
 
-    geobox : of the rasters; water : polygons on the grid, None for none; level_possible : whether possible water is
-    levelled too.
+    geobox : of the rasters; water_polygons : those on the grid, None for none; level_possible : whether possible water
+    is levelled too.
     """
-    found = WaterFound()
-    known = np.zeros(0, object) if water is None else water.polygons
-    possible = _possible_polygons(rasters, geobox, WaterCells(known, geobox), options)
-    found.n_possible = len(possible)
-    cells = WaterCells(np.concatenate([known, possible]), geobox)
-    levels: list[WaterLevel | None] = []
-    for k in range(len(known) + len(possible)):
-        is_known = k < len(known)
-        if not (is_known or level_possible):
-            levels.append(None)
-        elif water is not None and is_known and math.isfinite(water.levels_m[k]):
-            levels.append(WaterLevel(float(water.levels_m[k]), math.nan, "attribute", 0))
-        else:
-            width = options.shore_cells if is_known else OUTLINE_CELLS
-            levels.append(water_level(_heights_of(rasters, cells, k, width), options))
-    names = [*(water.names if water is not None else ()), *(f"possible water {k + 1}" for k in range(len(possible)))]
-    for k, (name, level) in enumerate(zip(names, levels, strict=True)):
-        is_known = k < len(known)
-        if level is None:
-            if is_known or level_possible:
-                found.left.append(name)
-            if not is_known:
-                _mark(rasters, cells, k)
-        else:
-            _write_level(
-                rasters,
-                cells,
-                k,
-                LevelledWater(name, Water.LEVELLED if is_known else Water.POSSIBLE_LEVELLED, level, 0),
-                found,
-            )
-    return found
+    surfaces = _known_surfaces(water_polygons)
+    known_cells = WaterCells(_polygons_of(surfaces), geobox)
+    possible = [
+        _Surface(f"possible water {k}", polygon, WaterKind.POSSIBLE)
+        for k, polygon in enumerate(_possible_polygons(rasters, geobox, known_cells, options), 1)
+    ]
+    surfaces += possible
+    cells, water_found = WaterCells(_polygons_of(surfaces), geobox), WaterFound(n_possible=len(possible))
+    wanted = [level_possible or surface.water_kind is not WaterKind.POSSIBLE for surface in surfaces]
+    levels = [
+        _level_of(rasters, cells, k, surface, options) if wanted[k] else None for k, surface in enumerate(surfaces)
+    ]
+    for k, (surface, level) in enumerate(zip(surfaces, levels, strict=True)):
+        if level is not None:
+            _write_level(rasters, cells, k, surface, level, water_found)
+            continue
+        if wanted[k]:
+            water_found.left.append(surface.name)
+        for part in cells.parts(k):
+            rasters.mark_water(part.row, part.col, part.is_surface, WaterKind.POSSIBLE)
+    return water_found
+
+
+def _known_surfaces(water_polygons: WaterPolygons | None) -> list[_Surface]:
+    """The water surfaces of polygons."""
+    if water_polygons is None:
+        return []
+    return [
+        _Surface(name, polygon, WaterKind.LEVELLED, float(level_m))
+        for name, polygon, level_m in zip(
+            water_polygons.names, water_polygons.polygons, water_polygons.levels_m, strict=True
+        )
+    ]
+
+
+def _polygons_of(surfaces: Sequence[_Surface]) -> NDArray[Any]:
+    """Polygons (n,) of water surfaces."""
+    return np.array([surface.polygon for surface in surfaces], object)
+
+
+def _level_of(
+    rasters: SurfaceRasters, cells: WaterCells, number: int, surface: _Surface, options: WaterOptions
+) -> WaterLevel | None:
+    """The level of a water surface; None where too few heights tell it. number : of the surface, from 0."""
+    if math.isfinite(surface.level_m):
+        return WaterLevel(surface.level_m, math.nan, "attribute", 0)
+    if surface.water_kind is WaterKind.POSSIBLE:
+        return water_level(_heights_of(rasters, cells, number, OUTLINE_CELLS).of_land(), options)
+    return water_level(_heights_of(rasters, cells, number, options.shore_cells), options)
 
 
 def _possible_polygons(
-    rasters: SurfaceRasters, geobox: GeoBox, known: WaterCells, options: WaterOptions
+    rasters: SurfaceRasters, geobox: GeoBox, known_cells: WaterCells, options: WaterOptions
 ) -> NDArray[Any]:  # fmt: skip
-    """Outlines (n,) of areas of possible water, in the CRS of the grid. known : water surfaces of polygons."""
+    """Outlines (n,) of areas of possible water, in the CRS of the grid. known_cells : water surfaces of polygons."""
     (rows, cols), cell_m = geobox.shape, float(geobox.transform.a)
     side = max(1, round(BLOCK_M / cell_m), math.ceil(math.sqrt(rows * cols / MAX_BLOCKS)))
     blocks, strip = WaterBlocks.empty((rows, cols), side), max(1, STRIP_ROWS // side) * side
     for row in range(0, rows, strip):
         shape = min(strip, rows - row), cols
         cells = rasters.heights(row, 0, shape)
-        blocks.add(row, cells.height, cells.quality, known.numbers(row, 0, shape) > 0)
+        blocks.add(row, cells.height, cells.quality, known_cells.numbers(row, 0, shape) > 0)
     outlines = []
     for area in possible_water(blocks, cell_m, options):
         corner = geobox[area.row * side :, area.col * side :]
@@ -207,30 +239,30 @@ def _heights_of(rasters: SurfaceRasters, cells: WaterCells, number: int, width_c
 
 
 def _write_level(
-    rasters: SurfaceRasters, cells: WaterCells, number: int, levelled: LevelledWater, found: WaterFound
+    rasters: SurfaceRasters,
+    cells: WaterCells,
+    number: int,
+    surface: _Surface,
+    level: WaterLevel,
+    water_found: WaterFound,
 ) -> None:
-    """Level the cells of a water surface, and add it to what was found."""
+    """Level the cells of a water surface, and add it to what was found. number : of the surface, from 0."""
+    kind = WaterKind.POSSIBLE_LEVELLED if surface.water_kind is WaterKind.POSSIBLE else surface.water_kind
     n_cells = 0
     for part in cells.parts(number):
-        quality = rasters.heights(part.row, part.col, part.is_surface.shape).quality
-        is_levelled = part.is_surface & ((quality & NOT_LEVELLED) == 0)
-        is_seen = is_levelled & ((quality & np.uint16(Quality.UNSEEN)) == 0)
-        found.n_seen += int(is_seen.sum())
-        is_matched = ~is_empty(quality) & ((quality & np.uint16(Quality.FILLED)) == 0)
-        found.n_matched += int((is_levelled & is_matched).sum())
+        written = rasters.heights(part.row, part.col, part.is_surface.shape)
+        is_levelled = part.is_surface & ((written.quality & NOT_LEVELLED) == 0)
+        is_seen = (written.quality & np.uint16(Quality.UNSEEN)) == 0
+        is_matched = np.isfinite(written.height) & ((written.quality & np.uint16(Quality.FILLED)) == 0)
         n_cells += int(is_levelled.sum())
-        rasters.level(part.row, part.col, is_levelled, levelled.level.height_m, levelled.level.sigma_m)
-        rasters.mark_water(part.row, part.col, is_levelled, levelled.kind)
-    found.levelled.append(LevelledWater(levelled.name, levelled.kind, levelled.level, n_cells))
+        water_found.n_seen += int((is_levelled & is_seen).sum())
+        water_found.n_matched += int((is_levelled & is_matched).sum())
+        rasters.level(part.row, part.col, is_levelled, level.height_m, level.sigma_m)
+        rasters.mark_water(part.row, part.col, is_levelled, kind)
+    water_found.levelled_surfaces.append(LevelledSurface(surface.name, kind, level, n_cells))
 
 
-def _mark(rasters: SurfaceRasters, cells: WaterCells, number: int) -> None:
-    """Mark the cells of an area as possible water."""
-    for part in cells.parts(number):
-        rasters.mark_water(part.row, part.col, part.is_surface, Water.POSSIBLE)
-
-
-def without_cells(water: WaterPolygons, geobox: GeoBox) -> Sequence[str]:
+def without_cells(water_polygons: WaterPolygons, geobox: GeoBox) -> Sequence[str]:
     """Names of the polygons that hold the centre of no cell of a grid."""
-    cells = WaterCells(water.polygons, geobox)
-    return [name for k, name in enumerate(water.names) if not cells.has_any(k)]
+    cells = WaterCells(water_polygons.polygons, geobox)
+    return [name for k, name in enumerate(water_polygons.names) if not cells.has_any(k)]

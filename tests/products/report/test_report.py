@@ -566,8 +566,37 @@ def test_every_reason_has_a_colour_of_its_group():
         assert flag.name in maps.FLAG_GROUPS[k][0] or flag in (Quality.OUTSIDE, Quality.UNSEEN)
     both = maps.groups_of(np.array([int(Quality.NO_MATCH | Quality.FILLED), int(Quality.FILLED)]))
     assert both[0] == both[1]  # filled, whatever was the matter
+    water = maps.groups_of(np.array([int(Quality.WATER), int(Quality.WATER | Quality.UNSEEN)]))
+    assert "WATER" in maps.FLAG_GROUPS[water[0]][0]
     colours = [colour for _, _, colour in maps.FLAG_GROUPS] + [maps.NO_FLAG[1]]
     assert len(set(colours)) == len(colours)
+
+
+def test_levelled_water_is_counted_as_water_alone(made):
+    """Neither as filled nor as a plane, and not among the cells that should be matched."""
+    found = survey_rasters(made)
+    codes = np.zeros_like(found.codes)
+    for code, n in ((0, 50), (Quality.WATER, 20), (Quality.WATER | Quality.UNSEEN, 3), (Quality.FILLED, 5),
+                    (Quality.PLANE, 7), (Quality.UNSEEN, 11), (Quality.OUTSIDE, 13)):  # fmt: skip
+        codes[int(code)] = n
+    counted = replace(found, codes=codes, n_heights=85)
+    assert [counted.count(flag) for flag in (Quality.WATER, Quality.FILLED, Quality.PLANE)] == [23, 5, 7]
+    assert (counted.n_covered, counted.n_matched) == (62, 57)
+    (row,) = (row for row in words.reasons(counted) if row.name == "WATER")
+    assert (row.n, row.fate, row.meaning) == (23, "levelled", words.MEANINGS[Quality.WATER])
+
+
+def test_the_summary_tells_levels_and_possible_water():
+    levels = [{"name": f"polygon {k}", "level_m": 400.0 + k, "kind": "levelled"} for k in range(1, 8)]
+    said = words.what_is_water({"water": {"levelled": levels, "possible": 2}})
+    assert said.startswith("7 water surfaces have one level each, not matched heights: polygon 1 at 401.00 m, ")
+    assert said.endswith(" and 2 more. Water is possible in 2 areas (3 in water.tif), where the images agree at no "
+                         "height.")  # fmt: skip
+    possible = [{"name": "possible water 1", "level_m": 1.0, "kind": "possible_levelled"}]
+    assert words.what_is_water({"water": {"levelled": possible, "possible": 1}}) == (
+        "1 water surface has one level, not matched heights: possible water 1 at 1.00 m."
+    )
+    assert words.what_is_water({}) == ""
 
 
 @pytest.mark.parametrize(

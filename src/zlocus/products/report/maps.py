@@ -32,9 +32,10 @@ STOPS = 17
 TICKS = 5
 WHITE = (255, 255, 255)
 # Groups of flags with the colours of Okabe and Ito, which colour-blind readers can distinguish. A cell belongs to the
-# first group that has one of its flags.
+# first group that has one of its flags; to that of WATER where it has both bits.
 FLAG_GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
     ("outside the area, or covered by fewer than two images", Quality.OUTSIDE | Quality.UNSEEN, WHITE),
+    ("water, levelled (WATER)", Quality.WATER, (10, 30, 130)),
     ("filled from its neighbours (FILLED)", Quality.FILLED, (86, 180, 233)),
     ("no height: tile failed (FAILED)", Quality.FAILED, (90, 60, 20)),
     ("no height: end of the height range (RANGE_END)", Quality.RANGE_END, (213, 94, 0)),
@@ -188,7 +189,7 @@ def groups_of(code: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of the first of `FLAG_GROUPS` to which values of quality.tif belong; `len(FLAG_GROUPS)` without one."""
     group = np.full(code.shape, len(FLAG_GROUPS))
     for k, (_, flags, _) in reversed(list(enumerate(FLAG_GROUPS))):
-        group[(code & int(flags)) != 0] = k
+        group[(code & int(flags)) == int(flags) if flags is Quality.WATER else (code & int(flags)) != 0] = k
     return group
 
 

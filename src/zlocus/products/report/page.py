@@ -17,7 +17,7 @@ from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.run_record import read_record
-from zlocus.matching.quality import Quality
+from zlocus.matching.quality import Quality, flags_of
 from zlocus.products.acquisitions import COLUMNS, acquisition_rows
 from zlocus.products.match_curve_drawing import SVG_PX
 from zlocus.products.report import maps, tables
@@ -274,7 +274,7 @@ def curves_part(path: Path, run: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
     """Values of the template for a cell and its match curves."""
-    names = [str(flag.name) for flag in Quality if cell["quality"] & flag]
+    names = [str(flag.name) for flag in flags_of(cell["quality"])]
     lines = [
         f"Row {cell['row']}, column {cell['col']} of the grid, at {cell['x']:.1f}, {cell['y']:.1f} m. "
         f"Reasons: {words.listed(names)}."

@@ -14,7 +14,7 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
 from zlocus.io.open_raster import open_raster
-from zlocus.matching.quality import EMPTY, Quality, is_empty
+from zlocus.matching.quality import EMPTY, Quality, is_empty, is_water
 
 RASTERS = ("dsm", "sigma", "quality", "views")
 MAX_SAMPLED_SIDE = 1500
@@ -65,25 +65,32 @@ class Survey:
 
     @property
     def n_covered(self) -> int:
-        """Number of cells inside the area that two images or more cover."""
-        return self.count_without(NOT_COVERED)
+        """Number of cells inside the area that two images or more cover, without levelled water."""
+        codes = np.arange(N_CODES)
+        return self.count_without(NOT_COVERED) - int(
+            self.codes[is_water(codes.astype(np.uint16)) & ((codes & int(NOT_COVERED)) == 0)].sum()
+        )
 
     @property
     def n_matched(self) -> int:
         """Number of cells whose height was matched, not filled."""
-        return self.n_heights - self.count(Quality.FILLED)
+        return self.n_heights - self.count(Quality.FILLED) - self.count(Quality.WATER)
 
     def count(self, flag: Quality) -> int:
         """Number of cells of the requested area that have a flag; for OUTSIDE, of the whole grid.
 
-        A flag that only warns is counted where there is a height of which it could warn.
+        A flag that only warns is counted where there is a height of which it could warn. Levelled water counts as
+        WATER, and neither as FILLED nor as PLANE.
         """
         which = np.arange(N_CODES, dtype=np.uint16)
-        has = (which & int(flag)) != 0
+        is_levelled = is_water(which)
+        has = is_levelled if flag is Quality.WATER else (which & int(flag)) != 0
+        if flag in (Quality.FILLED, Quality.PLANE):
+            has = has & ~is_levelled
         if flag is not Quality.OUTSIDE:
-            has &= (which & int(Quality.OUTSIDE)) == 0
+            has = has & ((which & int(Quality.OUTSIDE)) == 0)
         if flag not in EMPTY and flag is not Quality.IMAGE_EXCLUDED:
-            has &= ~is_empty(which)
+            has = has & ~is_empty(which)
         return int(self.codes[has].sum())
 
     def count_without(self, quality: Quality) -> int:

@@ -36,6 +36,7 @@ MEANINGS = {
     Quality.DISPUTED: "two groups of image pairs find different heights around the cell",
     Quality.IMAGE_EXCLUDED: "an image that may show the cell was not used: it sees the cell too obliquely",
     Quality.PLANE: "without texture of its own; the height is that of a plane fitted to the whole segment",
+    Quality.WATER: "water; the height is the level of its whole surface (the bits FILLED and PLANE together)",
 }
 # Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
 DESPITE_PEAK = {
@@ -77,6 +78,8 @@ STAGES = {
 SIDES = ("top", "upper right", "right", "lower right", "bottom", "lower left", "left", "upper left")
 NONE = "–"
 MIN_SHOWN_SHARE = 0.0001
+# The summary names at most this many water surfaces.
+MAX_NAMED_WATER = 5
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ class Reason:
 def reasons(survey: Survey) -> list[Reason]:
     """Reasons that occur: first those without a height, and the most common ones first."""
     rows = []
-    for flag in Quality:
+    for flag in (*Quality, Quality.WATER):
         n = survey.count(flag)
         if n:
             base = math.prod(survey.shape) if flag is Quality.OUTSIDE else survey.n_requested
@@ -109,11 +112,13 @@ def reasons(survey: Survey) -> list[Reason]:
 
 
 def fate(flag: Quality) -> str:
-    """Whether cells with a flag have a height: `none`, `filled`, `kept`, or `either`."""
+    """Whether cells with a flag have a height: `none`, `filled`, `levelled`, `kept`, or `either`."""
     if flag in EMPTY:
         return "none"
     if flag is Quality.IMAGE_EXCLUDED:
         return "either"
+    if flag is Quality.WATER:
+        return "levelled"
     return "filled" if flag is Quality.FILLED else "kept"
 
 
@@ -230,7 +235,7 @@ def summary(survey: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, 
             f"of a height is {size(quantiles[50], 'm')} or better for half of the cells, and "
             f"{size(quantiles[90], 'm')} or better for nine in ten."
         )
-    said += [what_is_missing(survey), what_is_doubtful(survey)]
+    said += [what_is_missing(survey), what_is_doubtful(survey), what_is_water(run)]
     return " ".join(sentence for sentence in said if sentence)
 
 
@@ -244,6 +249,22 @@ def what_is_missing(survey: Survey) -> str:
     reasons = "; ".join(f"{meaning} ({percent(n, survey.n_requested)})" for n, meaning in common)
     said = f"{percent(n_missing, survey.n_requested)} of the requested cells have no height, mostly because: {reasons}."
     return f"{said} A cell may have both reasons." if len(common) > 1 else said
+
+
+def what_is_water(run: Mapping[str, Any]) -> str:
+    """Levels of the water surfaces, and whether more water is possible, in sentences; "" without any."""
+    water = run.get("water", {})
+    levelled, n_possible, said = water.get("levelled", []), water.get("possible", 0), []
+    if levelled:
+        levels = [f"{each['name']} at {number(each['level_m'], 'm')}" for each in levelled[:MAX_NAMED_WATER]]
+        more = f" and {len(levelled) - MAX_NAMED_WATER} more" if len(levelled) > MAX_NAMED_WATER else ""
+        one = "surface has one level" if len(levelled) == 1 else "surfaces have one level each"
+        said.append(f"{len(levelled)} water {one}, not matched heights: {listed(levels)}{more}.")
+    n_kept = n_possible - sum(each["kind"] != "levelled" for each in levelled)
+    if n_kept > 0:
+        areas = "1 area" if n_kept == 1 else f"{n_kept} areas"
+        said.append(f"Water is possible in {areas} (3 in water.tif), where the images agree at no height.")
+    return " ".join(said)
 
 
 def what_is_doubtful(survey: Survey) -> str:
