@@ -46,6 +46,7 @@ ROWS: dict[str, Row] = {
     "fresh-realistic": Row("rows.realistic:fresh_realistic", WITH_RENDERER, is_slow=True),
     "realistic": Row("rows.realistic:realistic"),
     "troubles": Row("rows.troubles:troubles", WITH_RENDERER, is_slow=True),
+    "water": Row("rows.water:water", WITH_RENDERER, is_slow=True),
     "precision": Row("rows.standard_deviations:precision", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     # How hard the recipe is for other programs: from benchmarks/peers/results.json.
     "hardness": Row("rows.realistic:hardness", is_recorded=False),
