@@ -74,8 +74,8 @@ def _of_lakes(workplace: Workplace, views: str) -> list[Figure]:
         ),
         Figure(f"{views} views, natural shores: level off, largest", max(abs(one.off_m) for one in natural), "m"),
         Figure(
-            f"{views} views: range of the heights of a lake, largest", max(one.range_m for one in known), "m", at_most=0.0,
-            fails_when="a part of a lake has another level",
+            f"{views} views: range of the heights of a lake, largest", max(one.range_m for one in known), "m",
+            at_most=0.0, fails_when="a part of a lake has another level",
         ),
         Figure(
             f"{views} views: cells that disobey an outline", float(sum(one.n_wrong for one in known)), at_most=0.0,

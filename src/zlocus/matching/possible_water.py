@@ -91,7 +91,7 @@ def possible_water(blocks: WaterBlocks, cell_m: float, options: WaterOptions) ->
         col, row, cols, rows, n_blocks = (int(value) for value in boxes[number])
         if n_blocks * block_m2 < options.min_area_m2:
             continue
-        reach = -(-FAR_CELLS // blocks.side)
+        reach = _reach(FAR_CELLS, blocks.side, 4)
         near = slice(max(row - reach, 0), row + rows + reach), slice(max(col - reach, 0), col + cols + reach)
         if _lies_flat(blocks, near, labels[near] == number, options.max_rim_m):
             found.append(WaterArea(row, col, labels[row : row + rows, col : col + cols] == number))
@@ -118,9 +118,12 @@ def _lies_flat(blocks: WaterBlocks, part: tuple[slice, slice], is_area: BoolGrid
     lowest quarter counts, because banks and trees rise from a shore.
     """
     inside = is_area.astype(np.uint8)
-    rings = [cv2.dilate(inside, _square(cells, blocks.side)) > 0 for cells in (blocks.side, NEAR_CELLS, FAR_CELLS)]
+    touching, near, far = (
+        cv2.dilate(inside, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        for reach in (1, _reach(NEAR_CELLS, blocks.side, 2), _reach(FAR_CELLS, blocks.side, 4))
+    )
     height = blocks.height[part]
-    rim, around = (height[ring & ~rings[0] & np.isfinite(height)] for ring in rings[1:])
+    rim, around = (height[ring & ~touching & np.isfinite(height)] for ring in (near, far))
     if len(rim) < MIN_RIM_BLOCKS:
         return False
     lowest, level = np.percentile(rim, (10.0, 25.0))
@@ -130,7 +133,6 @@ def _lies_flat(blocks: WaterBlocks, part: tuple[slice, slice], is_area: BoolGrid
     return bool(level - lowest <= max_rim_m / 2.0 and not is_lower and not stands_above)
 
 
-def _square(cells: int, side: int) -> NDArray[np.uint8]:
-    """Structuring element that reaches a number of cells from its middle, in blocks."""
-    width = 2 * max(1, round(cells / side)) + 1
-    return np.ones((width, width), np.uint8)
+def _reach(cells: int, side: int, least: int) -> int:
+    """A distance in cells as a number of blocks, at least so many."""
+    return max(least, round(cells / side))

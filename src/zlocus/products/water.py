@@ -26,8 +26,8 @@ from zlocus.products.rasters import SurfaceRasters, WaterKind
 
 # Rows that are worked on at a time.
 STRIP_ROWS = 128
-# Possible water is looked for on at most this many blocks, of about this side.
-MAX_BLOCKS, BLOCK_M = 20_000_000, 1.0
+# Possible water is looked for on at most this many blocks, of about this side; each takes some 40 bytes of memory.
+MAX_BLOCKS, BLOCK_M = 5_000_000, 1.0
 # The outline of possible water is this far from its shore at most, in cells: about half of a correlation window.
 OUTLINE_CELLS = 8.0
 NOT_LEVELLED = np.uint16(Quality.OUTSIDE | Quality.FAILED)

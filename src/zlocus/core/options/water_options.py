@@ -36,7 +36,7 @@ class WaterOptions(Checked):
         low=0.5, high=1.0,
     )  # fmt: skip
     max_rim_m: float = option(
-        1.0, "Possible water: half of the heights around it differ by no more than this. Around roofs and on slopes "
-        "they differ by more.",
+        1.0, "Possible water: most of its surroundings lie at most this much lower than its rim, whose lowest heights "
+        "differ by half as much, and most of the area stands at most this much above it. Roofs and slopes do not.",
         low=0.01, high=100.0, unit="m",
     )  # fmt: skip
