@@ -107,6 +107,28 @@ def realistic_cells(it: Results, label: str, ending: str) -> list[str]:
     return [*(f"{value:.3f}" for value in values), f"{it.value(f'{label}, RMSE{ending}'):.1f}"]
 
 
+@table("water")
+def water(results: AllResults) -> str:
+    """Levels of lakes with different shores: root mean square of their errors, by views and by what is given."""
+    it = of_row(results, "water")
+    given = [("two", "exact"), ("three", "exact"), ("three", "1 m wide"), ("three", "1 m narrow"), ("two", "possible"),
+             ("three", "possible")]  # fmt: skip
+    words = {"exact": "outline given", "possible": "`--level-water`"}
+    names = list(dict.fromkeys(f.what.partition(", ")[0] for f in it.figures if f.what.startswith("lake-")))
+    head = ["lake", *(f"{views} views, {words.get(outline, f'outline {outline}')}" for views, outline in given)]
+    lines = [
+        [
+            name,
+            *(
+                f"{it.value(f'{name}, {views} views, {outline}: level off, root mean square'):.2f}"
+                for views, outline in given
+            ),
+        ]
+        for name in names
+    ]
+    return markdown(head, lines)
+
+
 @table("troubles")
 def troubles(results: AllResults) -> str:
     """Painted troubles: share of the cells with a height, and of these heights those off by more than 3 and 10 m."""

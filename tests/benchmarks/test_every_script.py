@@ -92,6 +92,7 @@ RUN_BY = {
     "terrain.py": "test_surfaces.py::test_the_benchmark_of_the_terrain",
     "terrain_features.py": "test_surfaces.py::test_the_benchmark_of_terrain_features",
     "threads.py": "test_speed.py::test_the_roofline_of_a_kernel_and_of_the_program",
+    "rows/water.py": "test_water_row.py::test_lakes_are_judged_against_their_truth",
     "workplace.py": "test_acceptance.py::test_a_command_is_measured_and_its_failure_told",
 }
 # What has a command line of its own, by how it is called; the other files are parts of these, or are run by pytest.

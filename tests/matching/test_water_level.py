@@ -9,7 +9,14 @@ import pytest
 
 from zlocus.core.options import WaterOptions
 from zlocus.matching.quality import Quality
-from zlocus.matching.water_level import WaterHeights, is_confident, shore_cells, water_level, weighted_quantile
+from zlocus.matching.water_level import (
+    SHORE_QUANTILE,
+    WaterHeights,
+    is_confident,
+    shore_cells,
+    water_level,
+    weighted_quantile,
+)
 
 LEVEL_M, EXACT_M = 431.5, 1e-4
 OPTIONS = WaterOptions()
@@ -18,8 +25,7 @@ NONE = np.zeros(0, np.float32)
 
 def heights(shore=NONE, beyond=NONE, inside=NONE, n_inside=1000, sigma=0.1):
     shore, beyond, inside = (np.asarray(each, np.float32) for each in (shore, beyond, inside))
-    of_shore, of_land = (np.full(each.shape, sigma, np.float32) for each in (shore, beyond))
-    return WaterHeights(2000, n_inside, inside, shore, of_shore, beyond, of_land)
+    return WaterHeights(n_inside, inside, shore, np.full(shore.shape, sigma, np.float32), beyond)
 
 
 def test_the_quantile_is_that_of_repeated_values():
@@ -31,13 +37,21 @@ def test_the_quantile_is_that_of_repeated_values():
 
 
 def test_the_level_is_that_of_the_shore_below_banks():
-    """A third of the shore is a bank: its heights are too high, and those at the level are most of the low ones."""
-    shore = np.r_[np.full(200, LEVEL_M), np.linspace(LEVEL_M, LEVEL_M + 2.0, 100)]
+    """Most of the shore is a bank: its heights are too high, and those at the level are most of the low ones."""
+    shore = np.r_[np.full(60, LEVEL_M), np.linspace(LEVEL_M + 0.01, LEVEL_M + 2.0, 240)]
     found = water_level(heights(shore, np.full(300, LEVEL_M + 1.0)), OPTIONS)
     assert (found.source, found.n_used) == ("rim", 300)
     assert found.height_m == pytest.approx(LEVEL_M, abs=EXACT_M)
-    # Half of the rise of the ground at the shore.
+    # Half of the rise of the ground at the shore; the lowest heights agree.
     assert found.sigma_m == pytest.approx(0.5, abs=EXACT_M)
+    assert water_level(heights(shore), OPTIONS, share=0.45).height_m > LEVEL_M + 0.5
+
+
+def test_heights_that_differ_make_the_level_uncertain():
+    shore = LEVEL_M + np.linspace(0.0, 1.0, 401)
+    found = water_level(heights(shore), OPTIONS)
+    assert found.height_m == pytest.approx(LEVEL_M + SHORE_QUANTILE, abs=0.01)
+    assert found.sigma_m == pytest.approx(SHORE_QUANTILE, abs=0.01)
 
 
 def test_a_precise_height_counts_more():
@@ -59,17 +73,12 @@ def test_still_water_with_texture_has_its_median():
     assert (few.source, few.height_m) == ("rim", pytest.approx(LEVEL_M, abs=EXACT_M))
 
 
-def test_the_land_side_tells_where_the_outline_is_too_narrow():
-    found = water_level(heights(np.full(29, LEVEL_M + 9.0), np.full(30, LEVEL_M)), OPTIONS)
-    assert (found.source, found.n_used, found.height_m) == ("rim", 30, pytest.approx(LEVEL_M, abs=EXACT_M))
-    with_shore = heights(np.full(50, LEVEL_M + 9.0), np.full(50, LEVEL_M), np.full(900, LEVEL_M + 4.0))
-    assert water_level(with_shore.of_land(), OPTIONS).height_m == pytest.approx(LEVEL_M, abs=EXACT_M)
-
-
 def test_too_few_heights_tell_no_level():
-    assert water_level(heights(np.full(29, LEVEL_M), np.full(29, LEVEL_M)), OPTIONS) is None
+    few = OPTIONS.min_shore_cells - 1
+    assert water_level(heights(np.full(few, LEVEL_M), np.full(few, LEVEL_M)), OPTIONS) is None
     assert water_level(heights(), OPTIONS) is None
-    assert water_level(heights(np.full(29, LEVEL_M)), replace(OPTIONS, min_shore_cells=29)) is not None
+    assert water_level(heights(inside=np.full(few, LEVEL_M), n_inside=few), OPTIONS) is None
+    assert water_level(heights(np.full(few, LEVEL_M)), replace(OPTIONS, min_shore_cells=few)) is not None
 
 
 def test_doubtful_heights_do_not_count():

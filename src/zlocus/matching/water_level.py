@@ -2,13 +2,14 @@
 
 Moving water looks different in every image, so that heights on it are noise. Within half a correlation window from the
 shore the window holds the edge between water and land, which all images show at the level of the water. Where the
-ground rises from the shore, and under trees, such heights are too high, never too low. So the level is a low quantile
-of them; `benchmarks/rows/water.py` measures it on rendered lakes with different shores.
+ground rises from the shore, and under trees, such heights are too high, never too low but for noise. So the level is a
+low quantile of the heights on both sides of the shore; `benchmarks/rows/water.py` measures it on rendered lakes with
+different shores.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,9 +22,12 @@ from zlocus.matching.quality import EMPTY, Quality
 NOT_CONFIDENT = np.uint16(
     EMPTY | Quality.WEAK | Quality.AMBIGUOUS | Quality.JUMP | Quality.FILLED | Quality.DISPUTED | Quality.PLANE
 )
-# Quantile of the heights at the shore, weighted by their precision. On rendered lakes it is off by .04 m (root mean
-# square) with three views; the 20 % quantile is too low on gentle shores, the 30 % quantile too high below banks.
-SHORE_QUANTILE = 0.25
+# Quantile of the heights at the shore, weighted by their precision, for outlines that are given. On rendered lakes with
+# three views, quantiles from 7.5 to 12.5 % and widths from 4 to 6 cells are off by the same .05 m (root mean square).
+# Where the outline is 1 m too wide or too narrow, low quantiles and wide bands are the best: these are off by .07 m.
+SHORE_QUANTILE = 0.075
+# The same where the outline is that of possible water, which lies inside the shore.
+POSSIBLE_QUANTILE = 0.15
 # Standard deviation of normally distributed values from their median absolute deviation.
 DEVIATION_PER_MAD = 1.4826
 
@@ -32,23 +36,15 @@ DEVIATION_PER_MAD = 1.4826
 class WaterHeights:
     """Confident heights of a water surface and its shore.
 
-    n_cells : number of its cells; inside : (n,) heights m of cells away from the shore, and n_inside, the number of all
-    such cells; shore, shore_sigma : (m,) m, heights beside the shore on its water side, and their standard deviations;
-    beyond, beyond_sigma : (k,) m, the same on its land side.
+    n_inside : number of its cells away from the shore; inside : (n,) m, heights of these; shore, shore_sigma : (m,) m,
+    heights beside the shore on both sides, and their standard deviations; beyond : (k,) m, those on the land side.
     """
 
-    n_cells: int
     n_inside: int
     inside: NDArray[np.float32]
     shore: NDArray[np.float32]
     shore_sigma: NDArray[np.float32]
     beyond: NDArray[np.float32]
-    beyond_sigma: NDArray[np.float32]
-
-    def of_land(self) -> WaterHeights:
-        """The heights without those on the water, where its outline is not known well."""
-        none = np.zeros(0, np.float32)
-        return replace(self, inside=none, shore=none, shore_sigma=none)
 
 
 @dataclass(frozen=True)
@@ -65,27 +61,25 @@ class WaterLevel:
     n_used: int
 
 
-def water_level(heights: WaterHeights, options: WaterOptions) -> WaterLevel | None:
+def water_level(
+    heights: WaterHeights, options: WaterOptions, share: float = SHORE_QUANTILE
+) -> WaterLevel | None:  # fmt: skip
     """The level of a water surface from confident heights; None where there are too few.
 
-    Where most of the surface has confident heights (ice, plants), their median. Else the quantile `SHORE_QUANTILE` of
-    those beside the shore on its water side; on its land side where these are too few, because an outline can be too
-    narrow. The standard deviation contains half of the rise of the ground at the shore, by which the level may be too
-    high.
+    Where most of the surface has confident heights (ice, plants), their median. Else the quantile `share` of those
+    beside the shore. The standard deviation contains half of the rise of the ground at the shore, by which the level
+    may be too high.
     """
     n = len(heights.inside)
     if n >= options.min_shore_cells and n >= options.min_inside_share * heights.n_inside:
         middle = float(np.median(heights.inside))
         return WaterLevel(middle, DEVIATION_PER_MAD * float(np.median(np.abs(heights.inside - middle))), "inside", n)
-    shore, sigma = heights.shore, heights.shore_sigma
-    if len(shore) < options.min_shore_cells:
-        shore, sigma = heights.beyond, heights.beyond_sigma
-    if len(shore) < options.min_shore_cells:
+    if len(heights.shore) < options.min_shore_cells:
         return None
-    low, level, middle = (weighted_quantile(shore, sigma, share) for share in (0.1, SHORE_QUANTILE, 0.5))
-    rise = float(np.median(heights.beyond)) - level if len(heights.beyond) else middle - level
-    noise = (level - low) / 2.0
-    return WaterLevel(level, float(np.hypot(noise, max(rise, 0.0) / 2.0)), "rim", len(shore))
+    level, next_lowest = (weighted_quantile(heights.shore, heights.shore_sigma, each) for each in (share, 2.0 * share))
+    rise = float(np.median(heights.beyond)) - level if len(heights.beyond) else 0.0
+    sigma = float(np.hypot(next_lowest - level, max(rise, 0.0) / 2.0))
+    return WaterLevel(level, sigma, "rim", len(heights.shore))
 
 
 def weighted_quantile(heights: NDArray[np.float32], sigma: NDArray[np.float32], share: float) -> float:

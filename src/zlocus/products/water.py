@@ -21,7 +21,14 @@ from zlocus.io.grid_inputs import cells_of_each, outline_of
 from zlocus.io.water_polygons import WaterPolygons
 from zlocus.matching.possible_water import WaterBlocks, possible_water
 from zlocus.matching.quality import Quality
-from zlocus.matching.water_level import WaterHeights, WaterLevel, is_confident, shore_cells, water_level
+from zlocus.matching.water_level import (
+    POSSIBLE_QUANTILE,
+    WaterHeights,
+    WaterLevel,
+    is_confident,
+    shore_cells,
+    water_level,
+)
 from zlocus.products.rasters import SurfaceRasters, WaterKind
 
 # Rows that are worked on at a time.
@@ -192,7 +199,7 @@ def _level_of(
     if math.isfinite(surface.level_m):
         return WaterLevel(surface.level_m, math.nan, "attribute", 0)
     if surface.water_kind is WaterKind.POSSIBLE:
-        return water_level(_heights_of(rasters, cells, number, OUTLINE_CELLS).of_land(), options)
+        return water_level(_heights_of(rasters, cells, number, OUTLINE_CELLS), options, POSSIBLE_QUANTILE)
     return water_level(_heights_of(rasters, cells, number, options.shore_cells), options)
 
 
@@ -217,25 +224,22 @@ def _possible_polygons(
 
 def _heights_of(rasters: SurfaceRasters, cells: WaterCells, number: int, width_cells: float) -> WaterHeights:
     """Confident heights of a water surface. width_cells : distance from the shore within which cells are beside it."""
-    n_cells, n_inside = 0, 0
-    held: dict[str, list[NDArray[np.float32]]] = {
-        name: [] for name in ("inside", "shore", "shore_sigma", "beyond", "beyond_sigma")
-    }
+    n_inside, none = 0, np.zeros(0, np.float32)
+    inside, shore, sigma, beyond = [none], [none], [none], [none]
     for part in cells.parts(number, math.ceil(width_cells) + 1):
         written = rasters.heights(part.row, part.col, part.is_surface.shape)
-        shore = shore_cells(part.is_surface, part.is_any, width_cells)
-        is_sure = is_confident(written.height, written.quality)
-        is_own = np.zeros(is_sure.shape, np.bool_)
+        at_shore = shore_cells(part.is_surface, part.is_any, width_cells)
+        is_own = np.zeros(part.is_surface.shape, np.bool_)
         is_own[part.own] = True
-        is_away = part.is_surface & ~shore.water & is_own
-        n_cells, n_inside = n_cells + int((part.is_surface & is_own).sum()), n_inside + int(is_away.sum())
-        held["inside"].append(written.height[is_away & is_sure])
-        for name, where in (("shore", shore.water), ("beyond", shore.land)):
-            counted = where & is_sure & is_own
-            held[name].append(written.height[counted])
-            held[f"{name}_sigma"].append(written.sigma[counted])
-    joined = {name: np.concatenate(values) if values else np.zeros(0, np.float32) for name, values in held.items()}
-    return WaterHeights(n_cells, n_inside, **joined)
+        is_sure = is_confident(written.height, written.quality) & is_own
+        is_away = part.is_surface & ~at_shore.water & is_own
+        n_inside += int(is_away.sum())
+        inside.append(written.height[is_away & is_sure])
+        is_beside = (at_shore.water | at_shore.land) & is_sure
+        shore.append(written.height[is_beside])
+        sigma.append(written.sigma[is_beside])
+        beyond.append(written.height[at_shore.land & is_sure])
+    return WaterHeights(n_inside, *(np.concatenate(each) for each in (inside, shore, sigma, beyond)))
 
 
 def _write_level(

@@ -12,13 +12,14 @@ class WaterOptions(Checked):
     """Levels of water surfaces, and areas in which the images say nothing and whose surroundings are flat."""
 
     shore_cells: float = option(
-        3.0, "The level is found from heights this close to the outline, on its water side: half of a correlation "
-        "window, which therefore holds the edge between water and land. Farther out on the water heights are noise.",
+        5.0, "The level is found from heights this close to the outline, on both sides: within about half of a "
+        "correlation window, which therefore holds the edge between water and land. Farther out on the water, heights "
+        "are noise.",
         low=1.0, high=50.0, unit="cells",
     )  # fmt: skip
     min_shore_cells: int = option(
-        30, "Fewest cells with a confident height from which a level is found. Their quantile has a standard "
-        "deviation of a fifth of their spread then.",
+        60, "Fewest cells with a confident height from which a level is found: a pond of 3 m across has as many at "
+        "its shore, with cells of 0.5 m.",
         low=5, high=100000, unit="cells",
     )  # fmt: skip
     min_inside_share: float = option(
