@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+import shapely
 import typer.main
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,7 @@ import camera_files
 import made_up_deliveries as deliveries
 from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
+from grid_input_files import write_water
 from places import ROOT
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
 from zlocus.cli.app import app
@@ -246,6 +248,15 @@ def lay_out_datums(folder: Path) -> None:
     (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
+def lay_out_lakes(folder: Path) -> None:
+    """Three images, a geoid, and two lakes, of which one has a level above it."""
+    lay_out_images(folder)
+    write_geoid(folder / "geoid.tif", np.full((8, 8), 48.0, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
+    x, y = CENTRE
+    lakes = [shapely.box(x - 10, y - 8, x - 2, y + 6), shapely.box(x + 2, y - 8, x + 9, y + 6)]
+    write_water(folder / "lakes.gpkg", lakes, LEVEL=[1.75, None])
+
+
 def lay_out_surface(folder: Path) -> None:
     """A flags raster, for what reads one."""
     (folder / "surface").mkdir()
@@ -272,6 +283,7 @@ LAID_OUT = {
     "docs/how-to/orient.md": lay_out_images,
     "docs/how-to/report.md": lay_out_comparison,
     "docs/how-to/vertical.md": lay_out_datums,
+    "docs/how-to/water.md": lay_out_lakes,
     "docs/reference/api.md": lay_out_images,
     "docs/reference/products.md": lay_out_products,
     "docs/reference/quality.md": lay_out_surface,
