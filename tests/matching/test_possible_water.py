@@ -27,12 +27,13 @@ def plain():
     return height, quality
 
 
-def areas(height, quality, side=2, options=OPTIONS, rows=60, known=None):
+def areas(height, quality, side=2, options=OPTIONS, rows=60, known=None, grey=None):
     blocks = WaterBlocks.empty((ROWS, COLS), side)
     known = np.zeros((ROWS, COLS), bool) if known is None else known
+    grey = np.full((ROWS, COLS), 500, np.uint16) + np.arange(COLS, dtype=np.uint16) if grey is None else grey
     for row in range(0, ROWS, rows):
         part = slice(row, row + rows)
-        blocks.add(row, height[part], quality[part], known[part])
+        blocks.add(row, height[part], quality[part], grey[part], known[part])
     found = np.zeros((ROWS, COLS), bool)
     for area in possible_water(blocks, CELL_M, options):
         cells = np.kron(area.is_water, np.ones((side, side), bool))
@@ -109,3 +110,17 @@ def test_small_areas_and_known_water_are_left_out(plain):
 def test_a_lake_across_the_border_of_the_grid(plain):
     height, quality = plain
     assert areas(np.roll(height, -110, axis=1), np.roll(quality, -110, axis=1))[60:130, :40].mean() > 0.6
+
+
+def test_what_saturates_the_sensor_is_no_water(plain):
+    """As bright as the brightest tenth of the rest, also where that saturates it too; glitter is dark on average."""
+    rng = np.random.default_rng(2)
+    grey = rng.integers(300, 700, (ROWS, COLS)).astype(np.uint16)
+    dark = grey.copy()
+    dark[LAKE] = np.where(rng.random(dark[LAKE].shape) < 0.05, 4095, 200)
+    assert areas(*plain, grey=dark).any()
+    white = grey.copy()
+    white[LAKE] = 4095
+    assert not areas(*plain, grey=white).any()
+    white[:, -40:] = 4095
+    assert not areas(*plain, grey=white).any()

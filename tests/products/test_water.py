@@ -60,7 +60,8 @@ def matched():
         height[away] += rng.normal(0.0, 3.0, int(away.sum()))
         quality[away] = Quality.WEAK | Quality.JUMP
     sigma = np.full(height.shape, 0.1, np.float32)
-    return Surface(height, sigma, quality, np.full(height.shape, 3, np.uint8), height.copy())
+    grey = np.where(quality == 0, rng.integers(300, 700, height.shape), 200).astype(np.float32)
+    return Surface(height, sigma, quality, np.full(height.shape, 3, np.uint8), grey)
 
 
 def made(folder, surface, water=None, level_possible=False, options=OPTIONS, side=70):

@@ -1,4 +1,4 @@
-"""Where water is possible: areas in which the images agree at no height, and whose surroundings are flat and not lower.
+"""Where water is possible: dark areas in which the images agree at no height, among flat ground that is not lower.
 
 The areas are looked for on blocks of cells, so that memory is bounded on large grids.
 """
@@ -6,6 +6,7 @@ The areas are looked for on blocks of cells, so that memory is bounded on large 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +29,9 @@ NEAR_CELLS, FAR_CELLS = 8, 32
 MIN_RIM_BLOCKS = 8
 # Water lies lowest: of the surroundings at most this share is lower than the rim by more than `max_rim_m`.
 MAX_SHARE_LOWER = 0.25
+# Of what is as bright as the brightest tenth of the other ground, the images say nothing because it saturates the
+# sensor: snow and white roofs.
+MAX_BRIGHTNESS_PERCENTILE = 90.0
 
 
 @dataclass
@@ -35,7 +39,8 @@ class WaterBlocks:
     """Counts and heights of square blocks of cells.
 
     side : cells; seen : (r, c) float32, number of cells that two images see; unmatched : those on which they do not
-    agree; height : m, mean of the confident heights, NaN without any; matched : m, mean of all heights.
+    agree; height : m, mean of the confident heights, NaN without any; matched : m, mean of all heights; grey : mean of
+    the grey values of cells with a height.
     """
 
     side: int
@@ -43,17 +48,23 @@ class WaterBlocks:
     unmatched: FloatGrid
     height: FloatGrid
     matched: FloatGrid
+    grey: FloatGrid
 
     @classmethod
     def empty(cls, shape: tuple[int, int], side: int) -> WaterBlocks:
         """Blocks without any cell. shape : rows and columns of the grid."""
         rows, cols = (-(-n // side) for n in shape)
-        zero, unknown = np.zeros((rows, cols), np.float32), np.full((rows, cols), np.nan, np.float32)
-        return cls(side, zero, zero.copy(), unknown, unknown.copy())
+        counts = (np.zeros((rows, cols), np.float32) for _ in range(2))
+        return cls(side, *counts, *(np.full((rows, cols), np.nan, np.float32) for _ in range(3)))
 
-    def add(self, row: int, height: FloatGrid, quality: NDArray[np.uint16], is_known: BoolGrid) -> None:
-        """Add whole rows of blocks. row : first row of cells; height : (r, c) m; quality : (r, c) uint16; is_known :
-        (r, c) bool, cells of water surfaces that are known already and do not count."""
+    def add(
+        self, row: int, height: FloatGrid, quality: NDArray[np.uint16], grey: NDArray[Any], is_known: BoolGrid
+    ) -> None:
+        """Add whole rows of blocks.
+
+        row : first row of cells; height : (r, c) m; quality : (r, c) uint16; grey : (r, c), of the ortho-image;
+        is_known : (r, c) bool, cells of water surfaces that are known already and do not count.
+        """
         seen = ((quality & np.uint16(Quality.OUTSIDE | Quality.UNSEEN)) == 0) & ~is_known
         unmatched = seen & ((quality & np.uint16(Quality.WEAK | Quality.NO_MATCH)) != 0)
         is_matched, is_sure = np.isfinite(height) & ~is_known, is_confident(height, quality) & ~is_known
@@ -64,6 +75,7 @@ class WaterBlocks:
         with np.errstate(invalid="ignore", divide="ignore"):
             self.height[rows] = self._sums(np.where(is_sure, z, np.float32(0.0))) / self._sums(is_sure)
             self.matched[rows] = self._sums(z) / self._sums(is_matched)
+            self.grey[rows] = self._sums(np.where(is_matched, grey, 0.0)) / self._sums(is_matched)
 
     def _sums(self, values: NDArray[np.generic]) -> FloatGrid:
         """Sums over the blocks of some rows of cells."""
@@ -93,7 +105,9 @@ def possible_water(blocks: WaterBlocks, cell_m: float, options: WaterOptions) ->
             continue
         reach = _reach(FAR_CELLS, blocks.side, 4)
         near = slice(max(row - reach, 0), row + rows + reach), slice(max(col - reach, 0), col + cols + reach)
-        if _lies_flat(blocks, near, labels[near] == number, options.max_rim_m):
+        if _lies_flat(blocks, near, labels[near] == number, options.max_rim_m) and _is_dark(
+            blocks.grey, labels == number
+        ):
             found.append(WaterArea(row, col, labels[row : row + rows, col : col + cols] == number))
     return found
 
@@ -131,6 +145,14 @@ def _lies_flat(blocks: WaterBlocks, part: tuple[slice, slice], is_area: BoolGrid
     stands_above = np.nanpercentile(matched, 25.0) > level + max_rim_m if np.isfinite(matched).any() else False
     is_lower = float((around < lowest - max_rim_m).mean()) > MAX_SHARE_LOWER
     return bool(level - lowest <= max_rim_m / 2.0 and not is_lower and not stands_above)
+
+
+def _is_dark(grey: FloatGrid, is_area: BoolGrid) -> bool:
+    """Whether an area is darker than the brightest other ground. grey : (r, c), NaN where unknown; is_area : (r, c)."""
+    area, others = (grey[part & np.isfinite(grey)] for part in (is_area, ~is_area))
+    if not (len(area) and len(others)):
+        return True
+    return bool(np.median(area) < np.percentile(others, MAX_BRIGHTNESS_PERCENTILE))
 
 
 def _reach(cells: int, side: int, least: int) -> int:

@@ -93,6 +93,10 @@ class SurfaceRasters:
         """Heights of cells that are written, whose first is (row, col) of the grid. shape : rows and columns."""
         return WrittenHeights(*(sink.read(row, col, shape) for sink in (self._dsm, self._sigma, self._quality)))
 
+    def grey(self, row: int, col: int, shape: tuple[int, int]) -> NDArray[Any]:
+        """Grey values, or values of the first colour, of the ortho-image as it is written, (r, c); see `heights`."""
+        return self._ortho.read(row, col, shape)
+
     def level(self, row: int, col: int, is_levelled: NDArray[np.bool_], height_m: float, sigma_m: float) -> None:
         """Give cells that are written the level of their water surface, and the flags that say so.
 

@@ -213,7 +213,8 @@ def _possible_polygons(
     for row in range(0, rows, strip):
         shape = min(strip, rows - row), cols
         cells = rasters.heights(row, 0, shape)
-        blocks.add(row, cells.height, cells.quality, known_cells.numbers(row, 0, shape) > 0)
+        is_known = known_cells.numbers(row, 0, shape) > 0
+        blocks.add(row, cells.height, cells.quality, rasters.grey(row, 0, shape), is_known)
     outlines = []
     for area in possible_water(blocks, cell_m, options):
         corner = geobox[area.row * side :, area.col * side :]
