@@ -17,6 +17,7 @@ from zlocus.core.options import WaterOptions
 from zlocus.io.water_polygons import WaterPolygons
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
+from zlocus.matching.water_level import is_confident, shore_cells
 from zlocus.products.rasters import SurfaceRasters, WaterKind
 from zlocus.products.water import level_water, without_cells
 
@@ -124,6 +125,17 @@ def test_levels_do_not_depend_on_tiles_and_strips(tmp_path, matched, monkeypatch
         np.testing.assert_array_equal(values, cut[name])
 
 
+@pytest.mark.parametrize("strip_rows", [128, 13])
+def test_every_cell_beside_the_shore_is_used_once(tmp_path, matched, monkeypatch, strip_rows):
+    monkeypatch.setattr(water_module, "STRIP_ROWS", strip_rows)
+    _, found = made(tmp_path, matched, polygons(LAKE_SHAPE, POND_SHAPE))
+    lake, pond = cells_of(LAKE_SHAPE), cells_of(POND_SHAPE)
+    sure = is_confident(matched.height, matched.quality)
+    for one, inside in zip(found.levelled_surfaces, (lake, pond), strict=True):
+        at_shore = shore_cells(inside, lake | pond, OPTIONS.shore_cells)
+        assert one.level.n_used == (sure & (at_shore.water | at_shore.land)).sum()
+
+
 def test_the_border_of_the_grid_is_no_shore(tmp_path, matched):
     """A lake that goes on beyond the grid: what is matched beside the border, by chance, does not count."""
     shape = shapely.box(-50.0, -20.0, 60.2, 70.3)
@@ -211,6 +223,9 @@ def test_possible_water_is_marked_and_levelled_on_request(tmp_path, matched):
     np.testing.assert_array_equal(read["water"] == WaterKind.POSSIBLE_LEVELLED, marked)
     assert (read["quality"][marked] == Quality.WATER).all()
     assert np.abs(read["dsm"][marked] - LAKE_M).max() < 0.1
+    # What a polygon holds is known, and no possible water.
+    (tmp_path / "c").mkdir()
+    assert made(tmp_path / "c", matched, polygons(LAKE_SHAPE, POND_SHAPE), options=options)[1].n_possible == 0
     assert len(np.unique(read["dsm"][marked])) == 2
 
 
