@@ -147,6 +147,8 @@ def test_kernels_are_compiled_by_our_decorator_only(module):
 NOUNS: dict[str, tuple[str, ...]] = {
     # The nouns of the style guide, section 2 and the words that every module shares.
     "CellWindow": ("window",),
+    "ImageMask": ("mask",),
+    "MaskEntry": ("entry", "mask"),
     "MatchScene": ("match_scene",),
     "Observations": ("observations",),
     "Orientation": ("orientation",),

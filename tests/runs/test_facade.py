@@ -15,9 +15,9 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import BundleAdjustmentOptions, OrientationOptions
 from zlocus.core.requests import ImportRequest
-from zlocus.io.local_axes import rotation_to_axes
 from zlocus.io.scene_file import open_scene
 from zlocus.orientation.orientation import OrientationRequest, orient
+from zlocus.sensors.frame_axes import rotation_to_axes
 from zlocus.synthetic.terrain import analytic_height
 
 MIN_COVERAGE, WITHIN_M, MIN_WITHIN = 0.9, 0.25, 0.95

@@ -115,6 +115,25 @@ class DecodedSource(Protocol):
         ...
 
 
+@runtime_checkable
+class MaskedSource(Protocol):
+    """An image of which a mask may cover pixels. They are not valid in the windows that are read."""
+
+    def masked(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """The pixels (r, c) of a window that its mask covers; None for an image without a mask."""
+        ...
+
+
+def masked_pixels(image: ImageSource, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+    """The pixels (r, c) of a window of an image that its mask covers; None for an image without a mask."""
+    return image.masked(row, col, rows, cols) if isinstance(image, MaskedSource) else None
+
+
+def has_mask(image: ImageSource) -> bool:
+    """Whether an image has a mask, whatever it covers."""
+    return masked_pixels(image, 0, 0, 1, 1) is not None
+
+
 def held_pixels(image: ImageSource) -> HeldPixels | None:
     """The cells of an image of which its file holds pixels; None where it holds all of them, as far as is known."""
     return image.held if isinstance(image, SparseSource) else None

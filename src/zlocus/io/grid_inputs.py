@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,8 @@ from rasterio.windows import Window
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, file_crs, raster_crs
 from zlocus.io.height_values import check_unit, is_fill
-from zlocus.io.open_raster import existing_file, open_raster
-from zlocus.io.stored_files import first_bytes, is_remote
+from zlocus.io.open_raster import open_raster
+from zlocus.io.vector_files import read_vector
 from zlocus.io.vertical import (
     ELLIPSOIDAL_DESCRIPTION,
     VerticalDatum,
@@ -33,17 +32,10 @@ from zlocus.io.vertical import (
     named_vertical_datum,
     vertical_part,
 )
-from zlocus.io.virtual_rasters import ARCHIVES
 
 # Polygon edges are straight in the CRS of their file. Before a conversion each is cut into pieces of at most this
 # fraction of the extent, so that they keep their course.
 MIN_PIECES_PER_EXTENT = 200
-MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
-# Vector formats that hold their polygons in the file itself.
-VECTOR_DRIVERS = (
-    "ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
-    "OpenFileGDB", "SQLite", "TopoJSON",
-)  # fmt: skip
 # Largest extent on the Earth, in any unit of a CRS.
 MAX_EXTENT = 1e9
 
@@ -153,51 +145,11 @@ def read_features(path: Path, crs: CRS, field: str | None = None) -> PolygonFeat
         The file is no vector file, refers to other files, is an archive, has several layers or no CRS, or holds
         anything but polygons; or its polygons have no such attribute.
     """
-    # Imported here, because it takes 0.1 to 0.3 s and only runs with polygons need it.
-    import pyogrio.raw
-
-    path = existing_file(path, "vector file")
-    begins = b"" if is_remote(path) else first_bytes(path)
-    if archive := next((name for start, name in ARCHIVES.items() if begins.startswith(start)), None):
-        raise InputError(f"The vector file {path} is an archive ({archive}), which is not followed. Unpack it.")
-    try:
-        layers = pyogrio.list_layers(path)[:, 0]
-        if len(layers) != 1:
-            raise InputError(
-                f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
-            )
-        if (kind := (info := pyogrio.read_info(path))["driver"]) not in VECTOR_DRIVERS:
-            raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
-        _check_field(path, field, [str(name) for name in info["fields"]])
-        with warnings.catch_warnings():
-            # The library warns of open rings and numbers that are not finite. Both are refused below.
-            warnings.simplefilter("ignore", RuntimeWarning)
-            meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=True)
-            polygons = shapely.from_wkb(wkb)
-    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
-        why = (
-            "some text in it is not UTF-8"
-            if isinstance(error, UnicodeError)
-            else " ".join(str(error).split())[:MAX_REASON_CHARACTERS]
-        )
-        raise InputError(
-            f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
-        ) from error
-    is_there = ~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)
-    polygons, numbers = polygons[is_there], np.flatnonzero(is_there) + 1
-    if not len(polygons) or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
-        raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
-    if meta["crs"] is None:
+    found = read_vector(path, field=field)
+    if found.crs is None:
         raise InputError(f"{path} has no CRS. Add it (a .prj file for a Shapefile).")
-    converted = _converted(polygons, path, file_crs(meta["crs"], path), crs)
-    return PolygonFeatures(converted, numbers, None if field is None else np.asarray(columns[0])[is_there])
-
-
-def _check_field(path: Path, field: str | None, known: list[str]) -> None:
-    """Refuse an attribute that the features of a file do not have."""
-    if field is not None and field not in known:
-        held = f"has {', '.join(known)}" if known else "has no attributes"
-        raise InputError(f"{path} {held}, and no attribute {field}. Check the name.")
+    converted = _converted(found.polygons, path, file_crs(found.crs, path), crs)
+    return PolygonFeatures(converted, found.numbers, found.values)
 
 
 def _converted(polygons: NDArray[Any], path: Path, own_crs: CRS, crs: CRS) -> NDArray[Any]:

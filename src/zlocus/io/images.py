@@ -20,6 +20,7 @@ from zlocus.io.archives import is_archived
 from zlocus.io.colour_image import ColourImage
 from zlocus.io.decoded_images import DECODED, whole_bytes
 from zlocus.io.image_acquisition import acquisition_of
+from zlocus.io.masks.image_mask import ImageMask
 from zlocus.io.open_raster import UNCOMPRESSED_DRIVERS, cached_raster, check_complete, open_raster
 from zlocus.io.stored_files import file_state, is_remote
 from zlocus.io.tiled_products import is_tile_index, named_tiles
@@ -53,7 +54,8 @@ class RasterImage:
     one value at the border, which are invalid, see `with_plateau`; held : the parts that a sparse file stores, see
     `SparseSource`; state : size and time of the file when it was opened, see `file_state`; sources : other files from
     which pixels or mask are read; decoded_bytes : see `DecodedSource`; acquisition : what the file says of the
-    exposure; colour_image : another image that gives its colours, None for its own.
+    exposure; colour_image : another image that gives its colours, None for its own; mask : pixels that show no ground,
+    None without a mask.
     """
 
     path: Path
@@ -70,6 +72,7 @@ class RasterImage:
     decoded_bytes: int = field(default=0, compare=False, repr=False)
     acquisition: Acquisition = field(default=NOT_KNOWN, compare=False, repr=False)
     colour_image: ColourImage | None = None
+    mask: ImageMask | None = field(default=None, compare=False, repr=False)
 
     def read(self, row: int, col: int, rows: int, cols: int) -> ImageWindow:
         """Read the window of rows x cols pixels that starts at (row, col) and lies inside the image.
@@ -88,7 +91,20 @@ class RasterImage:
         missing = None if self.held is None else self.held.missing(row, col, rows, cols)
         if missing is not None:
             window = drop_pixels(window, missing)
+        masked = self.masked(row, col, rows, cols)
+        if masked is not None:
+            window = drop_pixels(window, masked)
         return window if self.plateau is None else drop_pixels(window, self.plateau.covers(row, col, rows, cols))
+
+    def masked(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """The pixels (r, c) of a window that the mask covers; None without a mask.
+
+        Raises
+        ------
+        InputError
+            A file of the mask can no longer be read, or has changed its size.
+        """
+        return None if self.mask is None else self.mask.covers(row, col, rows, cols)
 
     @property
     def has_colours(self) -> bool:
@@ -253,6 +269,13 @@ def check_content(image: RasterImage) -> None:
             return
     some = f"{windows.n_read} windows spread over its {image.shape[0]} x {image.shape[1]} px"
     advice = "leave it out" if windows.is_whole else "cut out the part that shows something: gdal_translate -srcwin"
+    if first is None and image.mask is not None:
+        where = "" if windows.is_whole else f" in any of {some}"
+        masks = ", ".join(str(part.path) for part in image.mask.parts)
+        raise InputError(
+            f"{image.path} has no valid pixel outside its mask ({masks}){where}. Check the mask, or leave the image "
+            "out."
+        )
     if first is None:
         where = "" if windows.is_whole else f" in any of {some}"
         raise InputError(
@@ -366,7 +389,7 @@ def with_plateau(image: RasterImage) -> RasterImage:
     """
     if image.shape[0] * image.shape[1] > MAX_COUNTED_PX:
         return image
-    plateau = border_plateau(image)
+    plateau = border_plateau(replace(image, mask=None))
     if plateau is None:
         return image
     share = 100.0 * plateau.n_pixels / (image.shape[0] * image.shape[1])

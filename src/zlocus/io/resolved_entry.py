@@ -14,6 +14,8 @@ from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.colour_image import ColourImage
 from zlocus.io.deliveries.delivery import DeliveredView, describe, is_delivery, open_delivery
+from zlocus.io.masks.mask_entry import MaskEntry
+from zlocus.io.masks.vendor_masks import vendor_kind, vendor_mask
 
 # Parts of a compressed file cannot be read without what lies before them, which shows from this size on.
 SLOW_BYTES = 100 << 20
@@ -24,7 +26,7 @@ class ResolvedEntry:
     """A view before its image is opened.
 
     path : of the image; acquisition : what is known besides the image itself; colour_image : another image that gives
-    its colours.
+    its colours; masks : of pixels that show no ground, with paths that can be opened.
     """
 
     name: str
@@ -32,6 +34,7 @@ class ResolvedEntry:
     camera: CameraEntry
     acquisition: Acquisition = NOT_KNOWN
     colour_image: ColourImage | None = None
+    masks: tuple[MaskEntry, ...] = ()
 
 
 def entries_of(paths: Sequence[Path]) -> tuple[ResolvedEntry, ...]:
@@ -61,7 +64,14 @@ def _entry(view: DeliveredView) -> ResolvedEntry:
     if partner is not None and partner.image.colour_bands is not None:
         of = partner.image
         colour_image = ColourImage(of.pixels, of.camera, partner.image.colour_bands, partner.polynomials)
-    return ResolvedEntry(view.name, image.pixels, camera, image.acquisition, colour_image)
+    masks = [entry for path in image.masks if (entry := _mask_entry(path)) is not None]
+    return ResolvedEntry(view.name, image.pixels, camera, image.acquisition, colour_image, tuple(masks))
+
+
+def _mask_entry(path: Path) -> MaskEntry | None:
+    """The entry of a vendor's mask; None of one that is not applied, or of a kind that is not known."""
+    kind = vendor_kind(path)
+    return None if kind is None else vendor_mask(path, kind)
 
 
 def _warn_of_slow(entries: Sequence[ResolvedEntry]) -> None:

@@ -9,6 +9,7 @@ views:
     image: img_n1.tif                  # relative to this file
     camera: {kind: rpc, file: other_RPC.TXT, shift: [0.3, -1.2]}   # file and shift are optional
     date: 2026-05-17                   # optional: images of near dates are matched first
+    mask: clouds.tif                   # optional: pixels that show no ground
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import ConfigError, InputError, ZlocusError
 from zlocus.core.quoting import quoted
 from zlocus.core.scene import Acquisition, Scene, View, held_window, is_local
-from zlocus.core.sensor_model import FloatArray
+from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
-from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera
+from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera, RpcSource
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.crs import check_fits, checked_crs, local_frame, utm_zone
 from zlocus.io.images import (
@@ -44,12 +45,15 @@ from zlocus.io.images import (
     open_header,
     with_plateau,
 )
-from zlocus.io.local_axes import is_along, rotation_to_axes
+from zlocus.io.masks.ground_polygons import GroundView
+from zlocus.io.masks.mask_entry import MaskEntries
+from zlocus.io.masks.open_mask import open_masks
 from zlocus.io.open_raster import existing_file
 from zlocus.io.resolved_entry import ResolvedEntry, entries_of
 from zlocus.io.safe_documents import read_yaml
 from zlocus.io.schema import FiniteNumber, StrictModel, validate_document
 from zlocus.sensors.frame import FrameModel
+from zlocus.sensors.frame_axes import is_along, rotation_to_axes
 
 SCENE_SUFFIXES = (".yaml", ".yml")
 T = TypeVar("T")
@@ -96,12 +100,14 @@ class Area(StrictModel):
 
 
 class ViewEntry(StrictModel):
-    """An image and its camera. name : unique in the scene; date : of the exposure, None for what the image says."""
+    """An image and its camera. name : unique in the scene; date : of the exposure, None for what the image says; mask :
+    pixels that show no ground."""
 
     name: str = Field(min_length=1)
     image: str
     camera: SerializeAsAny[CameraEntry]
     date: datetime.date | None = None
+    mask: MaskEntries | None = None
 
     @field_validator("name")
     @classmethod
@@ -213,7 +219,9 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
     if frame is None:
         opened = [each for each in opened if attempt(each.entry, partial(_mean_centre, [each]))]
         frame = _frame_of(opened, None) if opened else None
-    views = [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(each.view, frame))]
+    views = (
+        [] if frame is None else [v for each in opened for v in attempt(each.entry, partial(_masked_view, each, frame))]
+    )
     scene = scene_input.scene(views, frame) if views and frame is not None else None
     refused = [refused_by_name[entry.name] for entry in scene_input.entries if entry.name in refused_by_name]
     return UsableViews(scene, (*refused_entries, *refused))
@@ -309,7 +317,18 @@ class _OpenedView:
         """The view in the frame of the scene."""
         entry = self.entry
         acquisition = entry.acquisition.completed_by(self.image.acquisition)
-        return View(entry.name, entry.path, self.image, self.camera.sensor(crs), self.camera.files, acquisition)
+        sensor = self.camera.sensor(crs)
+        image = self._masked_image(sensor, crs)
+        return View(entry.name, entry.path, image, sensor, self.camera.files, acquisition)
+
+    def _masked_image(self, sensor: SensorModel, crs: CRS) -> RasterImage:
+        """The image with the masks of its entry."""
+        if not self.entry.masks:
+            return self.image
+        mean_height = self.camera.rpc.height_off if isinstance(self.camera, RpcSource) else None
+        ground_view = GroundView(sensor, crs, self.image.shape, mean_height)
+        mask = open_masks(self.entry.masks, self.entry.path, ground_view, self.entry.name)
+        return replace(self.image, mask=mask, sources=(*self.image.sources, *mask.files))
 
 
 def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[RefusedView] | None = None) -> _SceneInput:
@@ -339,6 +358,15 @@ def _open_checked_view(entry: ResolvedEntry, folder: Path) -> _OpenedView:
     return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
 
 
+def _masked_view(opened_view: _OpenedView, crs: CRS) -> View:
+    """The view of an image that was checked without its mask."""
+    view = opened_view.view(crs)
+    if opened_view.entry.masks:
+        assert isinstance(view.image, RasterImage), "it was opened here"
+        check_content(view.image)
+    return view
+
+
 def _checked(image: RasterImage) -> RasterImage:
     """The image after the checks of its pixels, without a plateau at its border."""
     check_last_block(image)
@@ -362,7 +390,13 @@ def _from_scene_file(path: Path, crs: CRS | None, refused: list[RefusedView] | N
         raise ConfigError(f"{path} gives area.bounds in another CRS than --crs. Leave --crs out, or remove the area.")
     named = None if scene_file.frame is None else scene_file.frame.crs
     entries = tuple(
-        ResolvedEntry(view.name, path.parent / view.image, view.camera.with_default_crs(named), Acquisition(view.date))
+        ResolvedEntry(
+            view.name,
+            path.parent / view.image,
+            view.camera.with_default_crs(named),
+            Acquisition(view.date),
+            masks=tuple(entry.inside(path.parent) for entry in view.mask or ()),
+        )
         for view in scene_file.views
     )
     bounds = None if scene_file.area is None else scene_file.area.bounds

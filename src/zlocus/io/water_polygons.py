@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import quoted
 from zlocus.io.grid_inputs import read_features
 from zlocus.io.height_values import is_fill
-from zlocus.io.safe_text import decimal, quoted
+from zlocus.io.safe_text import decimal
 
 # No water on the Earth, above any datum in use, has a level beyond these, m.
 LEVELS_M = (-1000.0, 10000.0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError
 from zlocus.core.footprints import ground_sample_distance
-from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View
+from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View, masked_pixels
 from zlocus.sensors.correction import ReducedModel
 
 # The side of a cell is at least this share of the finest image's ground pixel.
@@ -56,6 +56,11 @@ class ReducedImage:
         total = self._means(np.where(window.valid, window.pixels, np.float32(0.0)))
         valid = share > 0.5
         return ImageWindow(np.where(valid, total / np.maximum(share, np.float32(1e-6)), np.float32(0.0)), valid)
+
+    def masked(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """See `MaskedSource`; a pixel is masked where half of the others are."""
+        masked = masked_pixels(self.full_image, *(number * self.factor for number in (row, col, rows, cols)))
+        return None if masked is None else self._means(masked.astype(np.float32)) >= 0.5
 
     @property
     def has_colours(self) -> bool:

@@ -25,10 +25,12 @@ class Quality(IntFlag):
     UNREFINED = 2048  # the sub-step refinement did not converge; the height is that of the semi-global constraint
     FILLED = 4096  # no match; the height is interpolated from the neighbours
     DISPUTED = 8192  # two groups of image pairs find different heights around the cell
-    IMAGE_EXCLUDED = 16384  # an image that may show the cell was not used: it sees the cell too obliquely
+    IMAGE_EXCLUDED = 16384  # an image that may show the cell was not used: its mask covers it, or it is too oblique
     PLANE = 32768  # without texture of its own; the height is that of a plane fitted to the whole segment
     # Both bits together, which no other cell has: water, whose height is the level of its whole surface.
     WATER = FILLED | PLANE
+    # Both at once: masks left fewer than two images.
+    MASKED = UNSEEN | IMAGE_EXCLUDED
 
 
 EMPTY = (

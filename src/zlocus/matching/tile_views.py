@@ -144,7 +144,7 @@ def tile_views(
         bends.append(table.bends / scale)
         shown_part = view.window.at_finest(level)
         is_projected.append(table.holds & may_show(table, shown_part, block, BESIDE_PX * scale, half + BESIDE_CELLS))
-        unusable.append(None if view.valid.all() else _grown(~view.valid, half))
+        unusable.append(None if view.valid.all() else grown(~view.valid, half))
     t_of_index = np.array(
         [(tile_grid.height_origin - tables[0].z_mid) / tables[0].z_half, tile_grid.height_step / tables[0].z_half]
     )
@@ -170,11 +170,11 @@ def tile_views(
     )
 
 
-def _grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
+def grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
     """Pixels (r, c) that no middle of a window of half width `half` may be on."""
     side = 2 * (half + 2) + 1
-    grown = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8))
-    return np.asarray(grown, np.bool_)
+    wider = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8))
+    return np.asarray(wider, np.bool_)
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,7 @@ def shortcoming_of(tally: Tally, doubts: Sequence[Doubt], out: Path, progress: P
 
 
 def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:
-    """Note where images were excluded, and refuse to call a run a success that has few heights.
+    """Note where images were excluded or masked, and refuse to call a run a success that has few heights.
 
     Raises
     ------
@@ -195,6 +195,10 @@ def check_coverage(tally: Tally, out: Path, progress: Progress) -> None:
             f"In {tally.n_left_out} cells an image that may show them took no part, for it sees them too obliquely "
             "over the heights searched there (IMAGE_EXCLUDED in quality.tif). Give --heights closer to those of the "
             "ground."
+        )
+    if tally.n_masked:
+        progress.note(
+            f"In {tally.n_masked} cells masks left fewer than two images (UNSEEN and IMAGE_EXCLUDED in quality.tif)."
         )
     if tally.coverage < SUFFICIENT_COVERAGE:
         raise CoverageError(

@@ -14,13 +14,14 @@ from odc.geo.geobox import GeoBox
 
 from zlocus.core.errors import StoppedError
 from zlocus.core.grid import CellWindow, Grid
-from zlocus.core.options import RunConfig
+from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.progress import Progress, Stage
 from zlocus.core.requests import DsmRequest
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.fill import filled, filled_from
+from zlocus.matching.masked_cells import with_masked_cells
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.matching.quality import Quality
@@ -43,12 +44,14 @@ MAX_NAMED_TILES = 3
 class Tally:
     """Counts over the requested cells of all tiles.
 
+    n_left_out : cells that an image sees too obliquely; n_masked : cells of which masks left fewer than two images;
     labelled_ties : labels of tie points, tile by tile; water_found : water surfaces, once all tiles are written.
     """
 
     n_seen: int = 0
     n_matched: int = 0
     n_left_out: int = 0
+    n_masked: int = 0
     evaluations: int = 0
     all_images: int = 0
     labelled_ties: list[LabelledTies] = field(default_factory=list)
@@ -61,7 +64,9 @@ class Tally:
         self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
         is_matched = np.isfinite(tile_product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
         self.n_matched += int(is_matched.sum())
-        self.n_left_out += int((asked & ((quality & np.uint16(Quality.IMAGE_EXCLUDED)) != 0)).sum())
+        self.n_left_out += tile_product.n_left_out
+        masked = np.uint16(Quality.MASKED)
+        self.n_masked += int((asked & ((quality & masked) == masked)).sum())
         self.evaluations += tile_product.evaluations
         self.all_images += tile_product.all_images
         if tile_product.labelled_ties is not None:
@@ -85,6 +90,7 @@ class Tally:
             "coverage": round(self.coverage, 6),
             "left_out_cells": self.n_left_out,
             "water": self.water_found.as_dict(),
+            "masked_cells": self.n_masked,
         }
 
 
@@ -337,13 +343,14 @@ class TileProduct:
     """What a run keeps of a tile.
 
     surface : of its kept cells; evaluations, all_images : see `TileResult`; labelled_ties : tie points with their
-    labels, None where images were not chosen.
+    labels, None where images were not chosen; n_left_out : cells that an image sees too obliquely.
     """
 
     surface: Surface
     evaluations: int = 0
     all_images: int = 0
     labelled_ties: LabelledTies | None = None
+    n_left_out: int = 0
 
     def arrays(self) -> Arrays:
         """The product as named arrays, for the checkpoint."""
@@ -351,6 +358,7 @@ class TileProduct:
         found: Arrays = {
             "height": surface.height, "sigma": surface.sigma, "quality": surface.quality, "views": surface.views,
             "ortho": surface.ortho, "evaluations": np.array([self.evaluations, self.all_images], np.int64),
+            "left_out": np.array(self.n_left_out, np.int64),
         }  # fmt: skip
         if self.labelled_ties is not None:
             found |= {
@@ -368,7 +376,7 @@ class TileProduct:
         labelled_ties = (
             LabelledTies(*(arrays[name] for name in ("xyz", "labels", "which"))) if "xyz" in arrays else None
         )
-        return cls(surface, done, every, labelled_ties)
+        return cls(surface, done, every, labelled_ties, int(arrays["left_out"]))
 
 
 @dataclass(frozen=True)
@@ -423,7 +431,11 @@ class TileJob:
             surface = filled_from(
                 surface, read_dem(self.terrain.path, geobox, self.terrain.vertical_datum, may_miss=True)
             )
+        # Until here the flag says that an image sees a cell too obliquely.
+        n_left_out = int(((surface.quality & np.uint16(Quality.IMAGE_EXCLUDED)) != 0).sum())
+        half = large_window_side(self.config.cost) // 2
+        surface = with_masked_cells(surface, tile.kept_window, self.match_scene, half)
         labelled_ties = None
         if result.tile_labels is not None:
             labelled_ties = LabelledTies.of(result.tile_labels, self.match_scene.ties, tile.core_window)
-        return TileProduct(surface, result.evaluations, result.all_images, labelled_ties)
+        return TileProduct(surface, result.evaluations, result.all_images, labelled_ties, n_left_out)

@@ -19,6 +19,7 @@ from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rollin
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.linescan_files import write_trajectory
 from zlocus.io.cameras.rpc_text import write_rpc_txt
+from zlocus.io.masks.mask_entry import MaskEntry
 from zlocus.io.scene_file import SCENE_SUFFIXES, SceneFile, ViewEntry, read_scene_file, write_scene_file
 from zlocus.products.point_cloud import file_names
 from zlocus.sensors.correction import ShiftedModel
@@ -46,7 +47,7 @@ class WrittenCamera:
 def write_cameras(out: Path, inputs: Sequence[Path], scene: Scene) -> dict[str, Any]:
     """Write the cameras of a corrected scene and a `scene.yaml` to a folder; return the entry of each view by name.
 
-    inputs : of the scene. Cameras of a scene file keep all that was not corrected.
+    inputs : of the scene. Cameras of a scene file keep all that was not corrected, and its views their masks.
 
     Raises
     ------
@@ -55,14 +56,15 @@ def write_cameras(out: Path, inputs: Sequence[Path], scene: Scene) -> dict[str, 
     ConfigError
         The image of a line scanner was shifted, which its files cannot express.
     """
-    entries = given_cameras(inputs)
+    entries, masks = given_cameras(inputs), given_masks(inputs, out)
     (out / FOLDER).mkdir(exist_ok=True)
     views, record = [], {}
     for view, name in zip(scene.views, file_names([v.name for v in scene.views]), strict=True):
         camera, folder = entries.get(view.name, (RpcCamera(), Path()))
         written = write_camera(out, name, camera, folder, view, scene)
         image = relative(view.path, out)
-        views.append(ViewEntry(name=view.name, image=image, camera=written.entry, date=view.date))
+        mask = masks.get(view.name)
+        views.append(ViewEntry(name=view.name, image=image, camera=written.entry, date=view.date, mask=mask))
         record[view.name] = written.entry.model_dump(mode="json", exclude_none=True)
         if written.fit_px is not None:
             record[view.name]["rpc_fit_max_px"] = written.fit_px
@@ -79,6 +81,20 @@ def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]
     if first.suffix.lower() not in SCENE_SUFFIXES:
         return {}
     return {view.name: (view.camera, first.parent) for view in read_scene_file(first).views}
+
+
+def given_masks(inputs: Sequence[Path], out: Path) -> dict[str, tuple[MaskEntry, ...]]:
+    """Masks of a scene file by view, with paths that start at `out`; empty where images are the input."""
+    (first, *_) = inputs
+    if first.suffix.lower() not in SCENE_SUFFIXES:
+        return {}
+    return {
+        view.name: tuple(
+            entry.model_copy(update={"file": relative(first.parent / entry.file, out)}) for entry in view.mask
+        )
+        for view in read_scene_file(first).views
+        if view.mask is not None
+    }
 
 
 def _kind_of(camera: CameraEntry) -> str:

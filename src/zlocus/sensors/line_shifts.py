@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.core.scene import ColourSource, HeldPixels, ImageSource, ImageWindow, held_pixels
+from zlocus.core.scene import ColourSource, HeldPixels, ImageSource, ImageWindow, held_pixels, masked_pixels
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.straighten_kernel import straighten
 
@@ -93,6 +93,16 @@ class StraightenedImage:
             valid = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         valid = valid[self._margin : self._margin + rows, self._margin : self._margin + cols]
         return ImageWindow(np.where(valid, pixels, np.float32(0.0)), valid)
+
+    def masked(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_] | None:
+        """See `MaskedSource`; a pixel is masked where one of those is from which it is interpolated."""
+        window = _Window.around((row, col, rows, cols), self.shape, self._margin)
+        masked = masked_pixels(self.displaced_image, *window.inside)
+        if masked is None:
+            return None
+        side = 2 * LANCZOS_PX + 1
+        wider = cv2.dilate(window.padded(masked).astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        return np.asarray(wider[self._margin : self._margin + rows, self._margin : self._margin + cols])
 
     def colours(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.float32]:
         """See `ColourSource`."""

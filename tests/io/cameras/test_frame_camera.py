@@ -11,11 +11,11 @@ from places import ROOT
 from rpc_fixtures import write_image
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.cameras.frame_camera import FrameCamera
-from zlocus.io.local_axes import rotation_to_z
 from zlocus.io.scene_file import open_scene, read_scene_file, write_scene_file
 from zlocus.sensors.distortion import BrownDistortion, FisheyeDistortion
 from zlocus.sensors.earth_frame import FRAME_SPACE, EarthSpace
 from zlocus.sensors.frame import rotation_from_angles
+from zlocus.sensors.frame_axes import rotation_to_z
 from zlocus.sensors.rolling_shutter import RollingShutter
 
 PIXELS = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60)

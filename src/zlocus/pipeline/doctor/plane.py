@@ -9,12 +9,12 @@ import numpy as np
 
 from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.local_axes import rotation_to_axes
 from zlocus.io.scene_file import read_scene_file
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.doctor.findings import POOR, Finding
 from zlocus.sensors.frame import FrameModel
+from zlocus.sensors.frame_axes import rotation_to_axes
 
 TRIPLES, SEED, FEWEST_TIES = 500, 0, 50
 ENOUGH_TIES = 2000  # that choose among the planes, about: up to twice as many

@@ -34,7 +34,7 @@ MEANINGS = {
     Quality.UNREFINED: "the sub-step refinement did not converge; the height is that of the semi-global constraint",
     Quality.FILLED: "no match; the height is interpolated from the neighbours",
     Quality.DISPUTED: "two groups of image pairs find different heights around the cell",
-    Quality.IMAGE_EXCLUDED: "an image that may show the cell was not used: it sees the cell too obliquely",
+    Quality.IMAGE_EXCLUDED: "an image that may show the cell was not used: its mask covers it, or it is too oblique",
     Quality.PLANE: "without texture of its own; the height is that of a plane fitted to the whole segment",
     Quality.WATER: "water; the height is the level of its whole surface (the bits FILLED and PLANE together)",
 }
@@ -54,7 +54,7 @@ DESPITE_PEAK = {
 HIGH_PEAK = 0.5
 # What the user can do about a flag, where something helps.
 ADVICE = {
-    Quality.UNSEEN: "add images, or choose a smaller area",
+    Quality.UNSEEN: "add images, or choose a smaller area; with IMAGE_EXCLUDED, a mask left too few of them",
     Quality.OCCLUDED: "add images from other directions",
     Quality.RANGE_END: "give a wider --heights",
     Quality.NO_MATCH: "usual on water, snow and other ground without texture; --fill interpolate closes small gaps",
@@ -62,7 +62,7 @@ ADVICE = {
     Quality.WEAK: "usual on vegetation, water and snow; check before use",
     Quality.AMBIGUOUS: "usual on repeating patterns and ground without texture; check before use",
     Quality.DISPUTED: "most gross errors in towns carry this flag; check before use",
-    Quality.IMAGE_EXCLUDED: "give --heights closer to those of the ground",
+    Quality.IMAGE_EXCLUDED: "look at its mask; without one, give --heights closer to those of the ground",
 }
 STAGES = {
     "open": "opening images and cameras",

@@ -1,4 +1,4 @@
-"""Rotations that turn the axes of cameras into a local frame with z up."""
+"""Rotations that turn given directions into the axes of a local frame."""
 
 from __future__ import annotations
 

@@ -1,0 +1,94 @@
+"""Read polygons from vector files: GeoPackage, GeoJSON, Shapefile and others that hold them in the file itself."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from zlocus.core.errors import InputError
+from zlocus.io.open_raster import existing_file
+from zlocus.io.stored_files import first_bytes, is_remote
+from zlocus.io.virtual_rasters import ARCHIVES
+
+MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
+# Vector formats that hold their polygons in the file itself.
+VECTOR_DRIVERS = (
+    "ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
+    "OpenFileGDB", "SQLite", "TopoJSON",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class VectorPolygons:
+    """The polygons (n,) of a vector file, shapely, none empty.
+
+    crs : as the file writes it, None without one; numbers : (n,) int64, place of each in the file, from 1; values :
+    (n,) of an attribute as the file holds it, None where none was asked for.
+    """
+
+    polygons: NDArray[np.object_]
+    crs: str | None
+    numbers: NDArray[np.int64]
+    values: NDArray[Any] | None = None
+
+
+def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None) -> VectorPolygons:
+    """Read the polygons of a vector file with one layer.
+
+    may_be_empty : whether it may have no features; field : name of an attribute that is read too.
+
+    Raises
+    ------
+    InputError
+        The file is no vector file, refers to other files, is an archive, has several layers, or holds anything but
+        polygons; or its polygons have no such attribute.
+    """
+    # Imported here, because it takes 0.1 to 0.3 s and only runs with polygons need it.
+    import pyogrio.raw
+
+    path = existing_file(path, "vector file")
+    begins = b"" if is_remote(path) else first_bytes(path)
+    if archive := next((name for start, name in ARCHIVES.items() if begins.startswith(start)), None):
+        raise InputError(f"The vector file {path} is an archive ({archive}), which is not followed. Unpack it.")
+    try:
+        layers = pyogrio.list_layers(path)[:, 0]
+        if len(layers) != 1:
+            raise InputError(
+                f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
+            )
+        if (kind := (info := pyogrio.read_info(path))["driver"]) not in VECTOR_DRIVERS:
+            raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
+        _check_field(path, field, [str(name) for name in info["fields"]])
+        with warnings.catch_warnings():
+            # The library warns of open rings and numbers that are not finite. Callers refuse both.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=True)
+            polygons = shapely.from_wkb(wkb)
+    except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
+        why = (
+            "some text in it is not UTF-8"
+            if isinstance(error, UnicodeError)
+            else " ".join(str(error).split())[:MAX_REASON_CHARACTERS]
+        )
+        raise InputError(
+            f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
+        ) from error
+    is_there = ~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)
+    polygons, numbers = polygons[is_there], np.flatnonzero(is_there) + 1
+    is_empty = not len(polygons) and not may_be_empty
+    if is_empty or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
+        raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
+    return VectorPolygons(polygons, meta["crs"], numbers, None if field is None else np.asarray(columns[0])[is_there])
+
+
+def _check_field(path: Path, field: str | None, known: list[str]) -> None:
+    """Refuse an attribute that the features of a file do not have."""
+    if field is not None and field not in known:
+        held = f"has {', '.join(known)}" if known else "has no attributes"
+        raise InputError(f"{path} {held}, and no attribute {field}. Check the name.")
