@@ -78,4 +78,4 @@ def mask_of(shape, *entries, rpc=None, mean_height=None) -> ImageMask:
 
 
 def whole(mask: ImageMask):
-    return mask.covers(0, 0, *mask.shape)
+    return mask.covers(0, 0, *mask.parts[0].shape)

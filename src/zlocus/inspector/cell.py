@@ -19,6 +19,7 @@ from zlocus.inspector.layers import reasons_of
 from zlocus.inspector.profile import reference_at
 from zlocus.inspector.reference import Reference
 from zlocus.inspector.restored_run import Restored
+from zlocus.matching.masked_cells import images_hidden_at
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.point_match import PlaceCurves, curves_at
 from zlocus.pipeline.report_inputs import NOT_SHOWN, SHOWN_WITHIN_CELLS, place_of_cell
@@ -90,6 +91,13 @@ def cell_record(folder: SurfaceFolder, reference: Reference | None, row: int, co
     if reference is not None:
         record["difference_m"] = cell["dsm"] - float(reference_at(folder, reference, np.array([[row, col]]))[0])
     return record
+
+
+def masked_by(restored: Restored, xy: FloatArray, height_m: float) -> list[str]:
+    """Names of the images whose masks cover a cell at its height. xy, height_m : see `match_record`."""
+    place = place_of_cell(xy, height_m, restored.run)
+    half = large_window_side(restored.config.cost) // 2
+    return images_hidden_at(restored.run.match_scene, place.xyz, half)
 
 
 def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: WhatIf) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from zlocus.core.errors import ConfigError, GeometryError, InputError, ZlocusErr
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.parallel import submitted
 from zlocus.evaluation.comparison import Comparison
-from zlocus.inspector.cell import WhatIf, cell_record, match_record
+from zlocus.inspector.cell import WhatIf, cell_record, masked_by, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
 from zlocus.inspector.queries import KINDS, MAX_VALUES, WINDOWS
@@ -175,9 +175,11 @@ class Inspection:
             return record | {"is_pending": True}
         if (error := _failure(self._scene)) is not None:
             return record | {"error": said(error)}
+        xy = self.folder.centre_of(*at)
         try:
             with self._matching:
-                match = match_record(self._scene.result(), self.folder.centre_of(*at), record["height_m"], what_if)
+                record["masked_by"] = masked_by(self._scene.result(), xy, record["height_m"])
+                match = match_record(self._scene.result(), xy, record["height_m"], what_if)
         except (GeometryError, InputError) as error:
             return record | {"error": str(error)}
         return record | {"match": match}

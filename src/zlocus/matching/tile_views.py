@@ -42,6 +42,8 @@ SMALL_BLOCK, SMALLEST_BLOCK = 4, 2
 # Blocks whose positions are bent are at most so large: over more cells the speed with which points move with height
 # changes too much for one relief (see `pixel_positions`).
 LARGEST_BENT_BLOCK = 16
+# Pixels around the window of a cell that must be usable too, for its interpolation.
+GROWN_PX = 2
 # A view shows no block whose box of corners and middles lies so far beside it, pixels of the level and cells, beyond
 # the windows of the cells at its border: what lies between the places and heights looked at is not farther away.
 BESIDE_PX, BESIDE_CELLS = 16.0, 4
@@ -172,7 +174,7 @@ def tile_views(
 
 def grown(unusable: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
     """Pixels (r, c) that no middle of a window of half width `half` may be on."""
-    side = 2 * (half + 2) + 1
+    side = 2 * (half + GROWN_PX) + 1
     wider = cv2.dilate(unusable.astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(wider, np.bool_)
 

@@ -16,6 +16,7 @@ from zlocus.core.requests import DsmRequest
 from zlocus.core.scene import Scene
 from zlocus.io.config import config_as_dict
 from zlocus.io.input_files import InputFiles
+from zlocus.io.masks.image_mask import masked_share
 from zlocus.io.run_record import Stopwatch, origin_record, request_as_dict, versions_record, write_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.pair_labels import LabelledTies
@@ -145,7 +146,7 @@ def run_record(
 def _request_record(
     request: DsmRequest, config: RunConfig, scene: Scene, inputs: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Request, options, time, versions, input files, and when and how the images were taken."""
+    """Request, options, time, versions, input files, when and how the images were taken, and how much masks cover."""
     return {
         "config": {"request": request_as_dict(request), "options": config_as_dict(config)},
         **origin_record(COMMANDS[DsmRequest], kernels_of_package()),
@@ -153,7 +154,14 @@ def _request_record(
         "inputs": list(inputs),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
         "acquisitions": acquisition_records(scene.views),
+        "masked_shares": masked_shares(scene),
     }
+
+
+def masked_shares(scene: Scene) -> dict[str, float]:
+    """Share of the pixels that the mask of each view covers, by its name; views without a mask are left out."""
+    shares = ((view.name, masked_share(view.image)) for view in scene.views)
+    return {name: round(share, 4) for name, share in shares if share is not None}
 
 
 def grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:

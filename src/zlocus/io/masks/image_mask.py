@@ -9,6 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from zlocus.core.scene import ImageSource, has_mask, masked_pixels
+
 # The share of a larger image that is masked is that of so many rows spread over it.
 MAX_PX_COUNTED_WHOLE, SAMPLED_ROWS = 1 << 24, 32
 ROWS_AT_A_TIME = 1024
@@ -31,12 +33,11 @@ class MaskPart(Protocol):
 class ImageMask:
     """All masks of an image; a pixel is masked where one of them covers it.
 
-    parts : the masks, at least one; files : all files that they are read from; shape : rows and columns of the image.
+    parts : the masks, at least one; files : all files that they are read from.
     """
 
     parts: tuple[MaskPart, ...]
     files: tuple[Path, ...]
-    shape: tuple[int, int]
 
     def covers(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_]:
         """The masked pixels (r, c) bool of a window.
@@ -52,18 +53,23 @@ class ImageMask:
             masked = masked | part.covers(row, col, rows, cols)
         return masked
 
-    def share(self) -> float:
-        """Share of the pixels that are masked; of a large image, that of rows spread over it.
 
-        Raises
-        ------
-        InputError
-            See `covers`.
-        """
-        rows, cols = self.shape
-        if rows * cols <= MAX_PX_COUNTED_WHOLE:
-            parts = [(row, min(ROWS_AT_A_TIME, rows - row)) for row in range(0, rows, ROWS_AT_A_TIME)]
-        else:
-            parts = [(int(row), 1) for row in np.linspace(0, rows - 1, SAMPLED_ROWS)]
-        n_masked = sum(int(self.covers(row, 0, count, cols).sum()) for row, count in parts)
-        return n_masked / (cols * sum(count for _, count in parts))
+def masked_share(image: ImageSource) -> float | None:
+    """Share of the pixels of an image that its mask covers, None without a mask; of a large image, that of rows spread
+    over it.
+
+    Raises
+    ------
+    InputError
+        See `ImageMask.covers`.
+    """
+    if not has_mask(image):
+        return None
+    rows, cols = image.shape
+    if rows * cols <= MAX_PX_COUNTED_WHOLE:
+        parts = [(row, min(ROWS_AT_A_TIME, rows - row)) for row in range(0, rows, ROWS_AT_A_TIME)]
+    else:
+        parts = [(int(row), 1) for row in np.linspace(0, rows - 1, SAMPLED_ROWS)]
+    masked = [masked_pixels(image, row, 0, count, cols) for row, count in parts]
+    n_masked = sum(int(part.sum()) for part in masked if part is not None)
+    return n_masked / (cols * sum(count for _, count in parts))

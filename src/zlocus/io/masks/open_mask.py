@@ -47,7 +47,7 @@ def open_masks(entries: Sequence[MaskEntry], image: Path, ground_view: GroundVie
         except InputError as error:
             raise InputError(f"The mask of the view {name}: {error}") from error
         files += [path, *_files_beside(path)]
-    return ImageMask(tuple(parts), tuple(files), ground_view.shape)
+    return ImageMask(tuple(parts), tuple(files))
 
 
 def _files_beside(path: Path) -> list[Path]:

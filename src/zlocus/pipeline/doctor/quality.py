@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.core.scene import ImageSource, held_window
+from zlocus.core.scene import ImageSource, has_mask, held_window, masked_pixels
 from zlocus.pipeline.doctor.findings import NOTE, Finding, poor
 
 SIDE_PX, MOST_WINDOWS = 512, 4  # windows along an axis
@@ -28,15 +28,16 @@ BLURRED_BESIDE_OTHERS = 2.0
 class ImageQuality:
     """Quality of an image, as shares of the pixels that were examined.
 
-    nodata : not valid; saturated : of the valid ones, at the greatest value; black : of the valid ones, exactly 0;
-    edge_px : sigma of the Gaussian by which a sharp edge is blurred, across the worse axis, NaN where there are no
-    edges.
+    nodata : not valid, without masked ones; saturated : of the valid ones, at the greatest value; black : of the valid
+    ones, exactly 0; edge_px : sigma of the Gaussian by which a sharp edge is blurred, across the worse axis, NaN where
+    there are no edges; masked : covered by the mask of the image, None without one.
     """
 
     nodata: float
     saturated: float
     black: float
     edge_px: float
+    masked: float | None = None
 
 
 def image_quality(image: ImageSource) -> ImageQuality:
@@ -48,11 +49,12 @@ def image_quality(image: ImageSource) -> ImageQuality:
         Where a window cannot be read.
     """
     top, left, *_ = held = held_window(image)
-    windows = [image.read(top + row, left + col, rows, cols) for row, col, rows, cols in sample_windows(held[2:])]
+    places = [(top + row, left + col, rows, cols) for row, col, rows, cols in sample_windows(held[2:])]
+    windows, masked = [image.read(*place) for place in places], _masked_share(image, places)
     values = np.concatenate([window.pixels[window.valid] for window in windows])
     n_pixels = sum(window.valid.size for window in windows)
     if not len(values):
-        return ImageQuality(1.0, 0.0, 0.0, math.nan)
+        return ImageQuality(1.0 - (masked or 0.0), 0.0, 0.0, math.nan, masked)
     # Weighted sums of colour bands are not whole numbers, although the bands are.
     slack = 0.5 if np.dtype(image.dtype).kind in "iu" else 0.0
     edges = []
@@ -60,11 +62,21 @@ def image_quality(image: ImageSource) -> ImageQuality:
         found = [edge_ratios(*((w.pixels.T, w.valid.T) if turned else (w.pixels, w.valid))) for w in windows]
         edges.append(edge_width(np.concatenate(found)))
     return ImageQuality(
-        nodata=1.0 - len(values) / n_pixels,
+        nodata=max(1.0 - len(values) / n_pixels - (masked or 0.0), 0.0),
         saturated=float(np.mean(values >= values.max() - slack)),
         black=float(np.mean(values == 0.0)),
         edge_px=max((edge for edge in edges if math.isfinite(edge)), default=math.nan),
+        masked=masked,
     )
+
+
+def _masked_share(image: ImageSource, places: Sequence[tuple[int, int, int, int]]) -> float | None:
+    """Share of the pixels of some windows that the mask of an image covers; None without a mask."""
+    if not has_mask(image):
+        return None
+    parts = [masked_pixels(image, *place) for place in places]
+    masked = np.concatenate([part.ravel() for part in parts if part is not None])
+    return float(masked.mean())
 
 
 def sample_windows(shape: tuple[int, int]) -> Iterator[tuple[int, int, int, int]]:
@@ -122,6 +134,8 @@ def quality_findings(names: Sequence[str], qualities: Sequence[ImageQuality]) ->
         findings += [poor(name, sentence) for sentence in (*grey_sentences(quality), *blur_sentences(quality, usual))]
         if quality.nodata > EMPTY:
             findings.append(Finding(NOTE, f"{name}: {percent(quality.nodata)} of its pixels are nodata.", (name,)))
+        if quality.masked is not None:
+            findings.append(Finding(NOTE, f"{name}: its mask covers {percent(quality.masked)} of its pixels.", (name,)))
     return findings
 
 

@@ -103,6 +103,7 @@ class Diagnosis:
         if quality is not None:
             record |= {
                 "nodata": _rounded(quality.nodata),
+                "masked": None if quality.masked is None else _rounded(quality.masked),
                 "saturated": _rounded(quality.saturated),
                 "black": _rounded(quality.black),
                 "edge_px": _rounded(quality.edge_px),

@@ -111,6 +111,12 @@ def reasons(survey: Survey) -> list[Reason]:
     return [row for _, _, row in sorted(rows, key=lambda each: each[:2])]
 
 
+def masks(shares: Mapping[str, float]) -> str:
+    """How much of each image its mask covers, as a sentence; "" without masks. shares : by the name of the view."""
+    parts = listed([f"{percent(share, 1.0)} of {name}" for name, share in shares.items()])
+    return f"Masks cover {parts}." if shares else ""
+
+
 def fate(flag: Quality) -> str:
     """Whether cells with a flag have a height: `none`, `filled`, `levelled`, `kept`, or `either`."""
     if flag in EMPTY:

@@ -171,12 +171,17 @@ function facts(record) {
   );
   // A cell without a height shows only the reasons for that.
   const said = record.height_m === null ? record.reasons.filter(({ fate }) => fate === "none") : record.reasons;
-  $("cell-reasons").replaceChildren(...said.map(reason));
+  $("cell-reasons").replaceChildren(...said.map(reason), ...masks(record.masked_by ?? []));
 }
 
 // Decimals of heights, which are at best precise to a tenth of a cell.
 function digits() {
   return digitsFor(surface.transform[0]);
+}
+
+// The images whose masks cover the cell.
+function masks(names) {
+  return names.map((name) => element("li", {}, "The mask of ", element("b", {}, name), " covers the cell."));
 }
 
 function reason({ name, meaning, fate, advice }) {
