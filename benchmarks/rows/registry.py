@@ -47,6 +47,7 @@ ROWS: dict[str, Row] = {
     "realistic": Row("rows.realistic:realistic"),
     "troubles": Row("rows.troubles:troubles", WITH_RENDERER, is_slow=True),
     "water": Row("rows.water:water", WITH_RENDERER, is_slow=True),
+    "clouds": Row("rows.clouds:clouds", WITH_RENDERER, is_slow=True),
     "precision": Row("rows.standard_deviations:precision", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     # How hard the recipe is for other programs: from benchmarks/peers/results.json.
     "hardness": Row("rows.realistic:hardness", is_recorded=False),

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import yaml
+from pyproj import CRS
 from rasterio.transform import from_origin
 
 import rows.realistic as realistic_rows
@@ -17,8 +19,13 @@ from peers import realistic as peer_scenes
 from peers.results import Results as PeerResults
 from peers.verdicts import MEAN_SCENE, lost_classes, severity, verdict_lines, with_means_of_seeds
 from result_files import Results
+from rows import clouds as cloud_rows
 from rows import troubles as trouble_rows
 from workplace import CannotRun, Figure, Workplace
+from zlocus.io.open_raster import open_raster
+from zlocus.sensors.rpc_fit import fit_rpc
+from zlocus.synthetic.cameras import SatelliteCamera
+from zlocus.synthetic.files import write_image
 
 TRUTH_STEP_M, CELLS = 0.25, 80
 SHARE = 1e-9
@@ -95,6 +102,45 @@ def test_a_trouble_is_matched_and_judged(tmp_path, monkeypatch):
     }
     assert sum("--trouble" in command for command in commands) == 2
     assert sum("dsm" in command for command in commands) == 2
+
+
+def test_a_cloud_is_masked_and_judged(tmp_path, monkeypatch):
+    """The copy of the scene has its cloud, mask and marks; a surface off by 11 m under the cloud misses both bars."""
+    town, side = tmp_path / "town", 120
+    write(town / "truth_dsm.tif", np.full((side, side), 50.0, np.float32), TRUTH_STEP_M)
+    write(town / "truth_class.tif", np.full((side, side), 2, np.uint8), TRUTH_STEP_M)
+    half_m = side * TRUTH_STEP_M / 2
+    camera = SatelliteCamera((5e5 + half_m, 5e6 - half_m, 50.0), (35.0, 35.0), 0.5, 1.0, -3.0)
+    numbers = np.random.default_rng(1).integers(200, 900, (71, 71)).astype(np.uint16)
+    rpc = fit_rpc(camera, numbers.shape, CRS.from_epsg(32632), (0.0, 120.0)).rpc
+    write_image(town / "img_n1.tif", numbers, rpc)
+    folder = cloud_rows.clouded_scene(town, tmp_path / "clouded", 2)
+    with open_raster(folder / "mask.tif") as mask, open_raster(folder / "cloud.tif") as marks:
+        assert 0.3 < mask.read(1).mean() < 0.6
+        under = marks.read(1) > 0
+    assert 0.1 < under.mean() < 0.6
+
+    def matched(command, accept):
+        """The surface without a mask is 11 m too high under the cloud, and that with the mask lacks a part."""
+        out, given = Path(command[command.index("-o") + 1]), Path(command[2]).name
+        heights = np.full(under.shape, 50.0, np.float32)
+        if given == "cloudy.yaml":
+            heights[under] = 61.0
+        if given == "masked.yaml":
+            heights[side // 2 :] = np.nan
+        write(out / "dsm.tif", heights, TRUTH_STEP_M)
+
+    monkeypatch.setattr(cloud_rows, "run", matched)
+    figures = {figure.what: figure for figure in cloud_rows.cloud_figures("town", folder, is_aligned=False)}
+    off = "under the cloud off by more than 10 m"
+    assert figures[f"town, without mask, {off}"].value == 1.0
+    assert not figures[f"town, without mask, {off}"].passes
+    assert figures[f"town, masked, {off}"].value == 0.0
+    lost = figures["town, three clear images less masked, within 0.5 m: all"]
+    assert lost.value == figures["town, three clear images less masked, with a height"].value > 0.005
+    assert not lost.passes
+    entries = [yaml.safe_load((folder / name).read_text())["views"][0] for name in ("masked.yaml", "cloudy.yaml")]
+    assert [entry.get("mask") for entry in entries] == ["mask.tif", None]
 
 
 def row(scene: str, program: str, within: float, rmse: float, **classes: float) -> dict:

@@ -17,7 +17,7 @@ from zlocus.core.errors import ConfigError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import DsmRequest
-from zlocus.core.scene import ImageWindow, Scene, View
+from zlocus.core.scene import ImageWindow, Scene, View, has_mask
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.matching.ground_pixels import (
@@ -75,6 +75,15 @@ def test_a_reduced_image_holds_means_of_valid_pixels():
             assert window.pixels[r, c] == pytest.approx(pixels[part][valid[part]].mean(), rel=1e-5)
         else:
             assert window.pixels[r, c] == 0
+
+
+def test_a_reduced_image_is_masked_where_most_of_its_pixels_are():
+    mask = np.random.default_rng(3).random((32, 41)) < 0.5
+    full = ArrayImage(np.ones(mask.shape, np.uint16), ~mask)
+    assert not has_mask(ReducedImage(full, 3))
+    full.masked = lambda row, col, rows, cols: mask[row : row + rows, col : col + cols]
+    reduced = ReducedImage(full, 3)
+    np.testing.assert_array_equal(reduced.masked(2, 4, 5, 6), ~reduced.read(2, 4, 5, 6).valid)
 
 
 @given(st.integers(2, 6), st.floats(-20, 20), st.floats(-20, 20), st.floats(20, 80))

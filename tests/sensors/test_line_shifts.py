@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from zlocus.core.scene import ColourSource, ImageWindow
+from zlocus.core.scene import ColourSource, ImageWindow, has_mask
 from zlocus.sensors.line_shifts import LANCZOS_PX, LineShifts, StraightenedImage, lanczos_weights
 from zlocus.sensors.straighten_kernel import straighten
 
@@ -30,10 +30,14 @@ class Pixels:
     valid: np.ndarray
     dtype: str = "float32"
     has_colours: bool = True
+    mask: np.ndarray | None = None
 
     @property
     def shape(self):
         return self.values.shape
+
+    def masked(self, row, col, rows, cols):
+        return None if self.mask is None else self.mask[row : row + rows, col : col + cols]
 
     def read(self, row, col, rows, cols):
         part = np.s_[row : row + rows, col : col + cols]
@@ -113,3 +117,13 @@ def test_the_kernel_does_what_its_slow_twin_does():
             part = pixels[first_row[r] : first_row[r] + 6, first_col[r] + c : first_col[r] + c + 6]
             twin[r, c] = row_weights[r] @ part @ col_weights[r]
     np.testing.assert_allclose(out, twin, atol=1e-4)
+
+
+def test_a_mask_hides_what_its_pixels_would_be_interpolated_into():
+    """As nodata does: what is not valid for a mask is what is masked."""
+    mask = np.zeros((ROWS, COLS), bool)
+    mask[30:40, 20:26] = mask[0, 0] = True
+    masked_image = StraightenedImage(replace(displaced(valid=~mask), mask=mask), SHIFTS)
+    for window in ((0, 0, ROWS, COLS), (25, 10, 30, 9)):
+        np.testing.assert_array_equal(masked_image.masked(*window), ~masked_image.read(*window).valid)
+    assert not has_mask(StraightenedImage(displaced(), SHIFTS))

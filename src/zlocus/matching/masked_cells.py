@@ -137,10 +137,10 @@ def _hidden_pixels(
     return HiddenPixels(view, pixel_window, grown(masked, half))
 
 
-def _n_left(views: Sequence[View], hiding: Sequence[HiddenPixels], xyz: FloatArray) -> NDArray[np.int64]:
+def _n_left(views: Sequence[View], all_hidden_pixels: Sequence[HiddenPixels], xyz: FloatArray) -> NDArray[np.int64]:
     """Number of images, (n,), that show each ground point and are not hidden there. xyz : (n, 3) m."""
     n_left = np.zeros(len(xyz), np.int64)
-    hidden_of_view = {id(hidden_pixels.view): hidden_pixels for hidden_pixels in hiding}
+    hidden_of_view = {id(hidden_pixels.view): hidden_pixels for hidden_pixels in all_hidden_pixels}
     for view in views:
         rows, cols = view.image.shape
         col, row = view.sensor.image_from_ground(xyz).T
