@@ -20,7 +20,8 @@ from pyproj import CRS
 from rasterio.errors import NotGeoreferencedWarning
 
 from marked_cells import marked_errors
-from rows.realistic import SHARED
+from peers.realistic import SHARED, judged_realistic
+from rows.realistic import CLASSES
 from seeds import fresh_seeds, over_seeds
 from workplace import COVERAGE_SHORT, ZLOCUS, Figure, Workplace, rendered_images, run
 from zlocus.evaluation.comparison import Comparison
@@ -50,7 +51,7 @@ def clouds(workplace: Workplace) -> list[Figure]:
     figures = over_seeds(seeds, lambda seed: _on_town(workplace.out, seed), ("within", "with a height"))
     for number, name in enumerate(SHARED):
         scene = clouded_scene(workplace.scene(name), workplace.out / name, number)
-        figures += cloud_figures(f"real-{name[-1]}", scene, is_aligned=True)
+        figures += cloud_figures(f"real-{name[-1]}", scene, is_realistic=True)
     return figures
 
 
@@ -59,7 +60,7 @@ def _on_town(out: Path, seed: int) -> list[Figure]:
     if not (rendered / "scene.json").exists():
         command = [sys.executable, "-m", "zlocus.synthetic", "-o", rendered, "--kind", "city", "--size", TOWN_CELLS]
         run([*command, "--views", 1 + len(CLEAR_VIEWS), "--seed", seed])
-    return cloud_figures("towns", clouded_scene(rendered, out / f"clouded{seed}", seed), is_aligned=False)
+    return cloud_figures("towns", clouded_scene(rendered, out / f"clouded{seed}", seed), is_realistic=False)
 
 
 def clouded_scene(scene: Path, folder: Path, seed: int) -> Path:
@@ -97,13 +98,12 @@ def clouded_scene(scene: Path, folder: Path, seed: int) -> Path:
     return folder
 
 
-def cloud_figures(label: str, scene: Path, is_aligned: bool) -> list[Figure]:
-    """Figures of a scene with a cloud. is_aligned : whether a shift is removed, which cameras that point elsewhere
-    leave."""
+def cloud_figures(label: str, scene: Path, is_realistic: bool) -> list[Figure]:
+    """Figures of a scene with a cloud. is_realistic : see `shares`."""
     clear = surface(scene, "three", rendered_images(scene, CLEAR_VIEWS))
     masked = surface(scene, "masked", [scene_file(scene, "mask.tif")])
     cloudy = surface(scene, "cloudy", [scene_file(scene, None)])
-    of_clear, of_masked = (shares(dsm, scene, is_aligned) for dsm in (clear, masked))
+    of_clear, of_masked = (shares(dsm, scene, is_realistic) for dsm in (clear, masked))
     figures = []
     for what, share in of_masked.items():
         figures.append(Figure(f"{label}, masked, {what}", share, is_detail=True))
@@ -119,7 +119,7 @@ def cloud_figures(label: str, scene: Path, is_aligned: bool) -> list[Figure]:
     figures += [Figure(f"{label}, {name}, {wrong}", off[name]) for name in ("three clear images", "masked")]
     fails_when = "the image with the cloud wins against images that agree"
     of_cloudy = Figure(f"{label}, without mask, {wrong}", off["without mask"])
-    figures.append(of_cloudy if is_aligned else replace(of_cloudy, at_most=MAX_OFF, fails_when=fails_when))
+    figures.append(of_cloudy if is_realistic else replace(of_cloudy, at_most=MAX_OFF, fails_when=fails_when))
     figures.append(
         Figure(
             f"{label}, without mask, {wrong}, more than with three", off["without mask"] - off["three clear images"],
@@ -150,15 +150,21 @@ def surface(scene: Path, name: str, inputs: Sequence[Path]) -> Path:
     return out / "dsm.tif"
 
 
-def shares(dsm: Path, scene: Path, is_aligned: bool) -> dict[str, float]:
-    """Shares within each threshold by class, and with a height, of all cells with truth."""
-    found = evaluate(
-        dsm,
-        Comparison(
-            scene / "truth_dsm.tif", scene / "truth_class.tif", align=is_aligned, threshold_m=THRESHOLDS_M[0],
-            more_thresholds_m=THRESHOLDS_M[1:],
-        ),
+def shares(dsm: Path, scene: Path, is_realistic: bool) -> dict[str, float]:
+    """Shares within each threshold by class, and with a height, of all cells with truth.
+
+    is_realistic : whether the scene is judged as in the rows of realistic scenes, after the common height of the ground
+    was removed: their cameras point elsewhere.
+    """
+    if is_realistic:
+        judged = judged_realistic(scene, dsm)
+        within = {f"within 1 m: {name}": judged[name]["within"] for name in CLASSES}
+        return within | {"with a height": judged["all"]["completeness"]}
+    comparison = Comparison(
+        scene / "truth_dsm.tif", scene / "truth_class.tif", threshold_m=THRESHOLDS_M[0],
+        more_thresholds_m=THRESHOLDS_M[1:],
     )  # fmt: skip
+    found = evaluate(dsm, comparison)
     classes: dict[str, ErrorStatistics] = {"all": found.statistics, **found.class_statistics}
     within = {
         f"within {limit_m:g} m: {name}": statistics.as_dict()["within_m"][f"{limit_m:g}"]

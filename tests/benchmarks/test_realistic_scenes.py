@@ -131,7 +131,7 @@ def test_a_cloud_is_masked_and_judged(tmp_path, monkeypatch):
         write(out / "dsm.tif", heights, TRUTH_STEP_M)
 
     monkeypatch.setattr(cloud_rows, "run", matched)
-    figures = {figure.what: figure for figure in cloud_rows.cloud_figures("town", folder, is_aligned=False)}
+    figures = {figure.what: figure for figure in cloud_rows.cloud_figures("town", folder, is_realistic=False)}
     off = "under the cloud off by more than 10 m"
     assert figures[f"town, without mask, {off}"].value == 1.0
     assert not figures[f"town, without mask, {off}"].passes

@@ -25,6 +25,7 @@ from grid_input_files import write_water
 from places import ROOT
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
 from zlocus.cli.app import app
+from zlocus.io.open_raster import open_raster
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import KNOWN_GEOIDS
 from zlocus.sensors.frame import FrameModel
@@ -257,6 +258,20 @@ def lay_out_lakes(folder: Path) -> None:
     write_water(folder / "lakes.gpkg", lakes, LEVEL=[1.75, None])
 
 
+def lay_out_masked(folder: Path) -> None:
+    """A scene file of three images, one with a mask over its right half."""
+    lay_out_images(folder)
+    names = ("img_1", "img_2", "img_3")
+    views = [{"name": name, "image": f"{name}.tif", "camera": {"kind": "rpc"}} for name in names]
+    views[0]["mask"] = "clouds.tif"
+    with open_raster(folder / "img_1.tif") as image:
+        mask = np.zeros(image.shape, np.uint8)
+    mask[:, mask.shape[1] // 2 :] = 1
+    write_image(folder / "clouds.tif", mask, None)
+    scene = {"schema": 1, "views": views}
+    (folder / "scene.yaml").write_text(json.dumps(scene), encoding="utf-8")
+
+
 def lay_out_surface(folder: Path) -> None:
     """A flags raster, for what reads one."""
     (folder / "surface").mkdir()
@@ -280,6 +295,7 @@ LAID_OUT = {
     "docs/how-to/import.md": lay_out_cameras,
     "docs/how-to/inspect.md": lay_out_images,
     "docs/how-to/large.md": lay_out_images,
+    "docs/how-to/masks.md": lay_out_masked,
     "docs/how-to/orient.md": lay_out_images,
     "docs/how-to/report.md": lay_out_comparison,
     "docs/how-to/vertical.md": lay_out_datums,

@@ -48,16 +48,25 @@ def with_planes_of_segments(result: LevelResult, config: RunConfig) -> LevelResu
     heights, core = result.heights, result.level.core
     planar = PlanarHeights(heights.vertex, np.zeros(heights.vertex.shape, np.bool_))
     n_views = len(result.tile_views.layout)
-    orthos = [ortho_image(result.tile_views, planar.height, view) for view in range(n_views)]
+    orthos = [_known_ortho(result, planar.height, view) for view in range(n_views)]
     agrees = np.ones(n_views, np.bool_) if result.agreement is None else agreeing_views(result.agreement)
     texture = [texture_unit(ortho, core) for ortho in orthos]
     agreeing = [view for view in range(n_views) if agrees[view]]
     second_sharpest = sorted(texture[view] for view in agreeing)[-2:][0]  # of a single view its own
     sharp_views = [view for view in agreeing if texture[view] * MAX_TEXTURE_RATIO_OF_SHARP_VIEW > second_sharpest]
     for number, view in enumerate(sharp_views[:MAX_VIEWS_FOR_PLANES]):
-        ortho = orthos[view] if number == 0 else ortho_image(result.tile_views, planar.height, view)
+        ortho = orthos[view] if number == 0 else _known_ortho(result, planar.height, view)
         planar = with_planes(result.tile_views, ortho, planar, result.visible, config.planes, core)
     return replace(result, heights=replace(heights, vertex=planar.height), is_planar=planar.is_planar)
+
+
+def _known_ortho(result: LevelResult, lattice_index: NDArray[np.float32], view: int) -> NDArray[np.float32]:
+    """The ortho-image (r, c) of a view on heights; NaN where masked pixels or nodata hide the ground, which would look
+    like a plain segment."""
+    ortho = ortho_image(result.tile_views, lattice_index, view)
+    if not result.tile_views.has_blocked[view]:
+        return ortho
+    return np.where(covers(result.visible)[view], ortho, np.float32(np.nan))
 
 
 def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:

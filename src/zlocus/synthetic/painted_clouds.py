@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zlocus.synthetic.textures import fractal_surface
 
 COVER_STREAM, TEXTURE_STREAM = 79, 83
-CLOUD_M, CLOUD_EXPONENT = 160.0, 1.6
+CLOUD_M, CLOUD_EXPONENT = 160.0, 2.4
 # Lumps of a cloud are as large as houses and as strong as their contrast, so that they can be matched like ground.
 TEXTURE_M, TEXTURE_EXPONENT, TEXTURE_SHARE = 20.0, 1.2, 0.08
 # Width of the soft edge, in standard deviations of the field that clouds are cut out of.
