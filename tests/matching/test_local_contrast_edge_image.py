@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from affine import Affine
@@ -105,3 +107,17 @@ def test_a_view_that_does_not_agree_with_the_others_gives_no_edges(covering):
 def test_where_no_view_shows_anything_no_edge_is_known(covering):
     nothing = edge_image(views_of(*plain(3)), SURFACE, np.zeros_like(covering), CORE, np.full(3, np.nan))
     assert np.isnan(nothing).all()
+
+
+def test_where_masked_pixels_hide_the_first_view_the_next_one_that_agrees_gives_edges(covering):
+    """Not the one that disagrees; and not where only the border of the image, and no mask, ends the first view."""
+    views, agrees = views_of(*plain(3)), np.array([0.9, 0.1, 0.9])
+    covering[0, :, 20:35] = False
+    covering[2, 30:] = False
+    border = edge_image(views, SURFACE, covering, CORE, agrees)
+    assert np.isnan(border[:, 20:35]).all()
+    hidden = replace(views, has_blocked=np.array([True, False, False]))
+    found = edge_image(hidden, SURFACE, covering, CORE, agrees)
+    np.testing.assert_array_equal(found[covering[0]], border[covering[0]])
+    np.testing.assert_allclose(found[:30, 20:35], 2.0, atol=1e-6)
+    assert np.isnan(found[30:, 20:35]).all()

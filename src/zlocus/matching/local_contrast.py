@@ -94,9 +94,17 @@ def edge_image(
     """Ortho-image of a tile at whose edges heights may jump, (r, c) float32; NaN where the view covers nothing.
 
     It is that of the first view that agrees with the others and covers at least half as much of the core as any view
-    that agrees. covering : see `agreement`, which gives `agrees` (i,).
+    that agrees. Where masked pixels or nodata hide the ground in it, it is that of the next one that agrees and covers
+    the cell: without edges, roofs under a mask lose theirs. covering : see `agreement`, which gives `agrees` (i,).
     """
     trusted = agreeing_views(agrees)
     shown = covering[:, *core].sum(axis=(1, 2))
     view = int(np.flatnonzero(trusted & (shown >= shown[trusted].max() / 2))[0])
-    return np.where(covering[view], ortho_image(tile_views, surface, view, covering[view]), np.float32(np.nan))
+    edges = np.where(covering[view], ortho_image(tile_views, surface, view, covering[view]), np.float32(np.nan))
+    if not tile_views.has_blocked[view]:
+        return edges
+    for other in np.flatnonzero(trusted).tolist():
+        missing = np.isnan(edges) & covering[other]
+        if missing.any():
+            edges = np.where(missing, ortho_image(tile_views, surface, other, missing), edges)
+    return edges
