@@ -42,7 +42,7 @@ def test_a_surface_whose_run_did_not_end_is_doubted(tmp_path):
         (("cloud.laz", "run.json"), r"holds a point cloud \(cloud\.laz, of `zlocus cloud`\) and no surface\. Give"),
         (("orientation.json", "run.json", "scene.yaml"), "holds tie points and corrected cameras"),
         (("demo.json",), "holds a demo, whose surface has not been finished"),
-        (("dsm.tif", "run.json"), r"lacks sigma\.tif, quality\.tif, views\.tif, ortho\.tif of the surface"),
+        (("dsm.tif", "run.json"), r"lacks sigma\.tif, quality\.tif, views\.tif, ortho\.tif, water\.tif of the surface"),
         (SURFACE_RASTERS, r"lacks run\.json"),
         (("inner/dsm.tif",), r"holds no surface, but .*inner may\. Give that folder"),
     ],
