@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
-from made_up_deliveries import dimap_delivery, shots, write_single, zipped
+from made_up_deliveries import maxar_delivery, shots, write_single, zipped
 from rendered_scenes import read, run
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import progress_for
@@ -30,7 +30,7 @@ def taken(images):
 @pytest.fixture(scope="module")
 def archive(taken, tmp_path_factory):
     folder = tmp_path_factory.mktemp("archive")
-    return zipped(dimap_delivery(folder / "delivery", taken), folder / "d.zip", zipfile.ZIP_STORED)
+    return zipped(maxar_delivery(folder / "delivery", taken), folder / "d.zip", zipfile.ZIP_STORED)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_the_heights_are_those_of_single_files(taken, surface, tmp_path):
         assert (surface / name).read_bytes() == (single / name).read_bytes(), name
     record = json.loads((surface / "run.json").read_text())
     assert [path["path"].rpartition("/")[2] for path in record["inputs"]] == ["d.zip"]
-    assert list(record["acquisitions"]) == ["PHR1A_20141005T160138", "PHR1A_20141005T160218"]
+    assert list(record["acquisitions"]) == ["WV03_20141005T160138", "WV03_20141005T160218"]
     assert record["image_dates"] == ["2014-10-05"] * 2
 
 
@@ -59,7 +59,7 @@ def test_the_ortho_image_has_the_colours(surface):
 
 
 def test_the_cloud_has_the_colours(archive, tmp_path):
-    request = CloudRequest((archive,), tmp_path / "cloud", crs="EPSG:32632", references=("PHR1A_20141005T160138",))
+    request = CloudRequest((archive,), tmp_path / "cloud", crs="EPSG:32632", references=("WV03_20141005T160138",))
     run_cloud(request, RunConfig(), progress_for(io.StringIO()))
     points = laspy.read(tmp_path / "cloud" / "cloud.laz")
     ratio = np.median(points.green / points.red)

@@ -14,6 +14,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
+from mask_files import box, gml
 from rpc_fixtures import dimap_rpc, gdal_rpc, rpb, rpc_txt, write_image
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.sensors.rpc import RpcCoefficients
@@ -22,6 +23,8 @@ from zlocus.sensors.rpc import RpcCoefficients
 RATIO = 4
 # Its bands are so many times the grey value: blue, green, red, near infrared.
 GAINS = {"B": 0.5, "G": 0.75, "R": 1.0, "N": 1.25}
+# Columns and rows that masks call cloud: the first, and the first beyond.
+CLOUDED = (40, 20, 70, 60)
 FIRST_TIME = datetime.datetime(2014, 10, 5, 16, 1, 38, tzinfo=datetime.UTC)
 SECONDS_APART = 40
 SUN_AZIMUTH, SUN_ELEVATION, VIEW_AZIMUTH, VIEW_ELEVATION, OFF_NADIR, CLOUD = 158.4, 51.2, 212.0, 70.5, 17.5, 0.25
@@ -37,6 +40,14 @@ class Shot:
     rpc: RpcCoefficients
     colours: dict[str, NDArray[np.uint16]]
     colour_rpc: RpcCoefficients
+
+    @property
+    def is_cloudy(self) -> NDArray[np.bool_]:
+        """The pixels under `CLOUDED`, (r, c)."""
+        found = np.zeros(self.grey.shape, np.bool_)
+        left, top, right, bottom = CLOUDED
+        found[top:bottom, left:right] = True
+        return found
 
     def bands(self, letters: str) -> NDArray[np.uint16]:
         return np.stack([self.colours[letter] for letter in letters])
@@ -100,6 +111,10 @@ def dimap_delivery(root: Path, taken: list[Shot], tile: tuple[int, int] | None =
             (folder / f"RPC_{name}.XML").write_text(dimap_rpc(rpc))
             (folder / f"DIM_{name}.XML").write_text(_dim(shot, kind, pixels.shape, size, files, name))
             (folder / f"PREVIEW_{name}.JPG").write_bytes(b"\xff\xd8\xff\xe0")
+            # Masks count the first pixel as (1, 1), at its centre.
+            left, top, right, bottom = (edge + 0.5 for edge in CLOUDED)
+            gml(folder / "MASKS" / f"CLD_{name}_MSK.GML", box(left, top, right, bottom))
+            gml(folder / "MASKS" / f"SNW_{name}_MSK.GML", box(1, 1, 30, 30), kind="SNOW", title="Snow mask")
     return root
 
 
@@ -141,6 +156,11 @@ def _dim(shot: Shot, kind: str, shape, size, files, name: str) -> str:
 <OVERLAP_COL>0</OVERLAP_COL></Regular_Tiling></Tile_Set></Raster_Dimensions>
 <Raster_Display><Raster_Index_List>{bands}</Raster_Index_List><Band_Display_Order>{order}</Band_Display_Order>
 </Raster_Display></Raster_Data>
+<Quality_Assessment><Imaging_Quality_Measurement>
+<Quality_Mask><Component><COMPONENT_PATH href="MASKS/CLD_{name}_MSK.GML"/></Component></Quality_Mask>
+<Quality_Mask><Component><COMPONENT_PATH href="MASKS/SNW_{name}_MSK.GML"/></Component></Quality_Mask>
+<Quality_Mask><Component><COMPONENT_PATH href="MASKS/QTE_{name}_MSK.GML"/></Component></Quality_Mask>
+</Imaging_Quality_Measurement></Quality_Assessment>
 <Geometric_Data><Use_Area>{place}</Use_Area></Geometric_Data>
 <Dataset_Sources><Source_Identification><Strip_Source><MISSION>PHR</MISSION><MISSION_INDEX>1A</MISSION_INDEX>
 <IMAGING_DATE>{shot.time:%Y-%m-%d}</IMAGING_DATE><IMAGING_TIME>{shot.time:%H:%M:%S}.0Z</IMAGING_TIME></Strip_Source>
@@ -251,7 +271,7 @@ def planet_delivery(root: Path, taken: list[Shot]) -> Path:
         ):  # fmt: skip
             write_image(root / f"{scene}_basic_{kind}.tif", pixels)
             (root / f"{scene}_basic_{kind}_RPC.TXT").write_text(rpc_txt(rpc))
-        write_udm2(root / f"{scene}_basic_panchromatic_udm2.tif", shot.grey.shape)
+        write_udm2(root / f"{scene}_basic_panchromatic_udm2.tif", shot.is_cloudy)
         properties = {
             "acquired": f"{shot.time:%Y-%m-%dT%H:%M:%S}.000000Z", "sun_azimuth": SUN_AZIMUTH,
             "sun_elevation": SUN_ELEVATION, "satellite_azimuth": VIEW_AZIMUTH, "view_angle": OFF_NADIR,
@@ -262,10 +282,10 @@ def planet_delivery(root: Path, taken: list[Shot]) -> Path:
     return root
 
 
-def write_udm2(path: Path, shape: tuple[int, int]) -> None:
-    """An unusable data mask of eight bands that calls all pixels clear."""
-    bands = np.zeros((8, *shape), np.uint8)
-    bands[0], bands[6] = 1, 100
+def write_udm2(path: Path, is_cloudy: NDArray[np.bool_]) -> None:
+    """An unusable data mask of eight bands, that calls some pixels (r, c) cloud and all others clear."""
+    bands = np.zeros((8, *is_cloudy.shape), np.uint8)
+    bands[0], bands[5], bands[6] = ~is_cloudy, is_cloudy, 100
     write_image(path, bands)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import tarfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,7 +63,9 @@ def made(taken, tmp_path_factory):
 
 
 def pixels(view):
-    return view.image.read(0, 0, *view.image.shape).pixels
+    """The pixels of an image, those under its mask included."""
+    image = replace(view.image, mask=None)
+    return image.read(0, 0, *image.shape).pixels
 
 
 @pytest.mark.parametrize("vendor", VENDORS)
@@ -118,6 +121,15 @@ def test_colours_are_those_of_the_multispectral_image(made, taken, vendor):
         np.testing.assert_allclose(found[inner], expected[inner], atol=0.03 * expected.std())
         part = view.image.colours(9, 21, 30, 40)
         np.testing.assert_allclose(part, colours[:, 9:39, 21:61], atol=0.03 * expected.std())
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_masks_of_clouds_are_obeyed_and_those_of_snow_are_not(made, taken, vendor):
+    for view, shot in zip(open_scene([made(vendor)]).views, taken, strict=True):
+        valid = view.image.read(0, 0, *view.image.shape).valid
+        has_mask = vendor.startswith(("dimap", "planet"))
+        assert np.array_equal(valid, ~shot.is_cloudy if has_mask else np.ones_like(valid))
+        assert bool([path for path in view.files if "MSK" in path.name or "udm" in path.name]) == has_mask
 
 
 def test_nitf_files_of_a_folder(taken, tmp_path):
