@@ -165,6 +165,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "ZlocusError": ("error",),
     # The classes of one protocol have its noun.
     "CameraEntry": ("camera", "entry"),
+    "ColourEntry": ("colours",),
     "DeliveredImage": ("image",),
     "DeliveredView": ("view",),
     "DepthRays": ("rays",),

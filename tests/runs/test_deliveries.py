@@ -12,13 +12,15 @@ import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
-from made_up_deliveries import maxar_delivery, shots, write_single, zipped
+from made_up_deliveries import dimap_delivery, maxar_delivery, shots, write_single, zipped
 from rendered_scenes import read, run
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import progress_for
-from zlocus.core.requests import CloudRequest
+from zlocus.core.requests import CloudRequest, OrientRequest
 from zlocus.core.rerun_request import RerunRequest
+from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.cloud import run_cloud
+from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rerun import run_again
 
 
@@ -64,6 +66,21 @@ def test_the_cloud_has_the_colours(archive, tmp_path):
     points = laspy.read(tmp_path / "cloud" / "cloud.laz")
     ratio = np.median(points.green / points.red)
     assert ratio == pytest.approx(0.75, abs=0.02)
+
+
+def test_corrected_cameras_keep_colours_and_masks(taken, archive, surface, tmp_path):
+    for kind, given in (("archive", archive), ("folder", dimap_delivery(tmp_path / "delivery", taken))):
+        oriented = tmp_path / kind
+        run_orient(OrientRequest((given,), oriented), RunConfig(), progress_for(io.StringIO()))
+        for view, shot in zip(open_scene([oriented / "scene.yaml"]).views, taken, strict=True):
+            assert view.image.has_colours
+            expected = np.ones_like(shot.is_cloudy) if kind == "archive" else ~shot.is_cloudy
+            assert np.array_equal(view.image.read(0, 0, *shot.grey.shape).valid, expected)
+    again = run((tmp_path / "archive" / "scene.yaml",), tmp_path / "again").out
+    with rasterio.open(again / "ortho.tif") as file, rasterio.open(surface / "ortho.tif") as before:
+        assert file.count == 3
+        # The cameras were corrected by some hundredths of a pixel.
+        assert np.abs(file.read().astype(float) - before.read()).mean() < 1.0
 
 
 def test_the_run_is_repeated_from_its_record(surface, tmp_path):

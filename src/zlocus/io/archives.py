@@ -85,6 +85,14 @@ def stored_file(path: Path) -> Path:
     return _parts(path)[0] if is_archived(path) else path
 
 
+def absolute_path(path: Path) -> Path:
+    """A path that starts at the root of the file system; in an archive, that of the archive does."""
+    if not is_archived(path):
+        return path.resolve()
+    archive, name = _parts(path)
+    return path_in_archive(archive.resolve(), name)
+
+
 def members(archive: Path) -> tuple[Member, ...]:
     """The files in an archive, in order of their names.
 

@@ -70,7 +70,7 @@ def _entry(view: DeliveredView) -> ResolvedEntry:
 
 def _mask_entry(path: Path) -> MaskEntry | None:
     """The entry of a vendor's mask; None of one that is not applied, or of a kind that is not known."""
-    kind = vendor_kind(path)
+    kind = vendor_kind(path) or ("classes" if path.suffix.lower() in (".tif", ".tiff") else None)
     return None if kind is None else vendor_mask(path, kind)
 
 

@@ -36,6 +36,7 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
 from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera, RpcSource
 from zlocus.io.cameras.frame_camera import FrameCamera
+from zlocus.io.colour_entry import ColourEntry
 from zlocus.io.crs import check_fits, checked_crs, local_frame, utm_zone
 from zlocus.io.images import (
     RasterImage,
@@ -100,14 +101,18 @@ class Area(StrictModel):
 
 
 class ViewEntry(StrictModel):
-    """An image and its camera. name : unique in the scene; date : of the exposure, None for what the image says; mask :
-    pixels that show no ground."""
+    """An image and its camera.
+
+    name : unique in the scene; date : of the exposure, None for what the image says; mask : pixels that show no ground;
+    colours : another image that gives its colours.
+    """
 
     name: str = Field(min_length=1)
     image: str
     camera: SerializeAsAny[CameraEntry]
     date: datetime.date | None = None
     mask: MaskEntries | None = None
+    colours: ColourEntry | None = None
 
     @field_validator("name")
     @classmethod
@@ -395,7 +400,8 @@ def _from_scene_file(path: Path, crs: CRS | None, refused: list[RefusedView] | N
             path.parent / view.image,
             view.camera.with_default_crs(named),
             Acquisition(view.date),
-            masks=tuple(entry.inside(path.parent) for entry in view.mask or ()),
+            None if view.colours is None else view.colours.opened(path.parent, path.parent / view.image),
+            tuple(entry.inside(path.parent) for entry in view.mask or ()),
         )
         for view in scene_file.views
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from zlocus.core.errors import ConfigError
+from zlocus.core.errors import ConfigError, ZlocusWarning
 from zlocus.core.scene import Scene, View, is_local
 from zlocus.core.sensor_model import SensorModel
+from zlocus.io.archives import absolute_path, is_archived
 from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rolling_shutter_entry
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.linescan_files import write_trajectory
 from zlocus.io.cameras.rpc_text import write_rpc_txt
+from zlocus.io.colour_entry import ColourEntry
+from zlocus.io.images import RasterImage
 from zlocus.io.masks.mask_entry import MaskEntry
+from zlocus.io.resolved_entry import entries_of
 from zlocus.io.scene_file import SCENE_SUFFIXES, SceneFile, ViewEntry, read_scene_file, write_scene_file
 from zlocus.products.point_cloud import file_names
 from zlocus.sensors.correction import ShiftedModel
@@ -64,7 +69,11 @@ def write_cameras(out: Path, inputs: Sequence[Path], scene: Scene) -> dict[str, 
         written = write_camera(out, name, camera, folder, view, scene)
         image = relative(view.path, out)
         mask = masks.get(view.name)
-        views.append(ViewEntry(name=view.name, image=image, camera=written.entry, date=view.date, mask=mask))
+        views.append(
+            ViewEntry(
+                name=view.name, image=image, camera=written.entry, date=view.date, mask=mask, colours=colours(view, out)
+            )
+        )
         record[view.name] = written.entry.model_dump(mode="json", exclude_none=True)
         if written.fit_px is not None:
             record[view.name]["rpc_fit_max_px"] = written.fit_px
@@ -73,6 +82,15 @@ def write_cameras(out: Path, inputs: Sequence[Path], scene: Scene) -> dict[str, 
     described = {"schema": 1, "frame": frame, "area": area, "heights": scene.heights, "views": tuple(views)}
     write_scene_file(out / SCENE, SceneFile.model_validate(described))
     return record
+
+
+def colours(view: View, out: Path) -> ColourEntry | None:
+    """The entry of the image that gives the colours of a view; None where there is none. out : folder of the file."""
+    colour_image = view.image.colour_image if isinstance(view.image, RasterImage) else None
+    if colour_image is None:
+        return None
+    camera = None if colour_image.camera is None else relative(colour_image.camera, out)
+    return ColourEntry(image=relative(colour_image.path, out), bands=colour_image.bands, camera=camera)
 
 
 def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]:
@@ -84,16 +102,21 @@ def given_cameras(inputs: Sequence[Path]) -> dict[str, tuple[CameraEntry, Path]]
 
 
 def given_masks(inputs: Sequence[Path], out: Path) -> dict[str, tuple[MaskEntry, ...]]:
-    """Masks of a scene file by view, with paths that start at `out`; empty where images are the input."""
+    """Masks of a scene file or of deliveries by view, with paths that start at `out`."""
     (first, *_) = inputs
-    if first.suffix.lower() not in SCENE_SUFFIXES:
-        return {}
+    if first.suffix.lower() in SCENE_SUFFIXES:
+        given = {
+            view.name: [entry.inside(first.parent) for entry in view.mask or ()]
+            for view in read_scene_file(first).views
+        }
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ZlocusWarning)  # said when the deliveries were opened first
+            given = {entry.name: list(entry.masks) for entry in entries_of(inputs)}
     return {
-        view.name: tuple(
-            entry.model_copy(update={"file": relative(first.parent / entry.file, out)}) for entry in view.mask
-        )
-        for view in read_scene_file(first).views
-        if view.mask is not None
+        name: tuple(entry.model_copy(update={"file": relative(Path(entry.file), out)}) for entry in masks)
+        for name, masks in given.items()
+        if masks
     }
 
 
@@ -200,7 +223,9 @@ def write_scanner(
 
 
 def relative(path: Path, folder: Path) -> str:
-    """A path relative to a folder, as scene files have it; absolute where none exists."""
+    """A path relative to a folder, as scene files have it; absolute where none exists, and in an archive."""
+    if is_archived(path):
+        return absolute_path(path).as_posix()
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     except ValueError:  # another drive

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pyproj import CRS
@@ -66,12 +68,32 @@ def _may_be_of_one_pass(image_a: DeliveredImage, image_b: DeliveredImage) -> boo
 
 
 def _partner(image_a: DeliveredImage, image_b: DeliveredImage) -> ColourPartner | None:
-    """The map between two images; None where the cameras say that they are of different passes or places."""
+    places = common_places((image_a.pixels, image_a.camera), (image_b.pixels, image_b.camera))
+    return None if places is None else ColourPartner(image_b, places.polynomials, places.distance_px)
+
+
+class CommonPlaces(NamedTuple):
+    """Where the pixels of an image lie in another one of the same pass, and by how much that is off at most, px."""
+
+    polynomials: PlacePolynomials
+    distance_px: float
+
+
+def common_places(first: tuple[Path, Path | None], second: tuple[Path, Path | None]) -> CommonPlaces | None:
+    """The map from one image to another; None where the cameras say that they are of different passes or places.
+
+    first, second : file of the pixels and file of the RPC, None for the one in it or beside it.
+
+    Raises
+    ------
+    InputError
+        A camera or an image cannot be read.
+    """
     shapes = []
-    for each in (image_a, image_b):
-        with open_raster(each.pixels) as source:
+    for pixels, _ in (first, second):
+        with open_raster(pixels) as source:
             shapes.append(source.shape)
-    pan, colour = (RpcModel(read_rpc(each.pixels, each.camera), CRS.from_epsg(4978)) for each in (image_a, image_b))
+    pan, colour = (RpcModel(read_rpc(*each), CRS.from_epsg(4978)) for each in (first, second))
     row, col = (np.linspace(0.0, side - 1.0, N_POINTS) for side in shapes[0])
     xy = np.stack(np.meshgrid(col, row), axis=-1).reshape(-1, 2)
     seen = []
@@ -87,4 +109,4 @@ def _partner(image_a: DeliveredImage, image_b: DeliveredImage) -> ColourPartner 
     inside = ((at > -0.5) & (at < np.array(shapes[1])[::-1] - 0.5)).all(axis=1).mean()
     if distance_px > MAX_DISTANCE_PX or inside < MIN_INSIDE:
         return None
-    return ColourPartner(image_b, polynomials, distance_px)
+    return CommonPlaces(polynomials, distance_px)
