@@ -9,6 +9,7 @@ from pydantic import field_validator
 from zlocus.core.errors import InputError
 from zlocus.io.colour_image import ColourImage
 from zlocus.io.deliveries.pairing import MAX_DISTANCE_PX, common_places
+from zlocus.io.open_raster import open_raster
 from zlocus.io.schema import StrictModel, WholeNumber
 
 
@@ -39,6 +40,10 @@ class ColourEntry(StrictModel):
             An image or an RPC is missing or damaged, or they do not show the same ground in the same pass.
         """
         path, camera = folder / self.image, None if self.camera is None else folder / self.camera
+        with open_raster(path) as source:
+            n_bands = source.count
+        if max(self.bands) > n_bands:
+            raise InputError(f"{path} has {n_bands} bands, and no band {max(self.bands)}. Check `bands`.")
         places = common_places((image, None), (path, camera))
         if places is None:
             raise InputError(
