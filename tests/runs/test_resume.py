@@ -164,7 +164,7 @@ def test_a_worker_that_is_killed_costs_no_tile(images, straight_in_nine, tmp_pat
 # Function in which the run is stopped after the matching, number of the call, and files that are complete by then.
 AFTERWARDS = {
     "zlocus.pipeline.tile_run.TileRun.assemble": (1, set()),
-    # In the third of five rasters.
+    # In the third of six rasters.
     "zlocus.io.rasters._check_written": (6, set()),
     "zlocus.pipeline.surface_products.write_observations": (1, {"dsm.tif", "ties.gpkg"}),
     "zlocus.pipeline.dsm.write_report_inputs": (1, {"dsm.tif", "observations.npz"}),
@@ -406,7 +406,7 @@ GOES = {
         6,
         r"tiles has gone since the run began, with 3 finished tiles in it",
     ),
-    "zlocus.io.rasters._check_written": (1, r"ortho\.tif cannot be written"),
+    "zlocus.io.rasters._check_written": (1, r"water\.tif cannot be written"),
     "zlocus.pipeline.surface_products.write_observations": (1, r"observations\.npz cannot be written: No such file"),
     "zlocus.pipeline.surface_products.write_derived": (1, r"run\.json cannot be written: No such file"),
     "zlocus.pipeline.surface_products.link_all": (1, r"There is no raster \S*dsm\.tif"),
