@@ -122,3 +122,13 @@ def test_bars_are_for_terminals_only():
 
     assert isinstance(progress_for(Terminal()), BarProgress)
     assert isinstance(progress_for(io.StringIO()), LineProgress)
+
+
+def test_a_stage_of_one_step_shows_that_something_is_done():
+    """Its bar would stand at 0 until the end, so it has none that fills."""
+    progress = BarProgress()
+    with progress.stage("Matching", 1):
+        assert progress._bars.tasks[0].total is None
+    with progress.stage("Matching", 2) as stage:
+        stage.advance()
+        assert progress._bars.tasks[0].percentage == 50.0

@@ -69,7 +69,7 @@ def test_flags_are_named(written):
 
 def test_rasters_written_from_a_surface_know_crs_and_what_is_missing(written, tmp_path):
     surface = zlocus.open(written)
-    for name, nodata in (("height", np.nan), ("views", 0), ("quality", None), ("ortho", None)):
+    for name, nodata in (("height", np.nan), ("views", 0), ("quality", None), ("ortho", 0)):
         surface[name].rio.to_raster(tmp_path / f"{name}.tif")
         with rasterio.open(tmp_path / f"{name}.tif") as file, rasterio.open(written / VARIABLES[name][0]) as source:
             assert CRS.from_wkt(file.crs.to_wkt()).to_2d() == UTM

@@ -97,7 +97,7 @@ Settings = Annotated[
 ]  # fmt: skip
 DryRun = Annotated[
     bool,
-    typer.Option("--dry-run", help="Print the plan and write nothing.", rich_help_panel=RUN),
+    typer.Option("--dry-run", help="Print the plan, which takes tie points, and make nothing.", rich_help_panel=RUN),
 ]
 SurfaceFolderArgument = Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")]
 Reference = Annotated[Path | None, typer.Option(help="Raster of reference heights to compare with.", metavar="RASTER")]

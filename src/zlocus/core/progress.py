@@ -153,7 +153,8 @@ class BarProgress:
             self._bars = bars
             bars.start()
         self._depth += 1
-        task = bars.add_task(name, total=total, told="")
+        # A stage of one step would stand at nothing until its end: its bar moves to and fro instead.
+        task = bars.add_task(name, total=None if total == 1 else total, told="")
         try:
             yield _BarStage(bars, task)
             done = total if total is not None else 1

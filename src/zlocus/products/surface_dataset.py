@@ -99,7 +99,7 @@ def _variable(folder: Path, name: str) -> xr.DataArray:
     file, long_name, unit = VARIABLES[name]
     raster = rioxarray.open_rasterio(folder / file)
     assert isinstance(raster, xr.DataArray)
-    nodata = raster.rio.nodata
+    nodata = 0 if name == "ortho" else raster.rio.nodata  # its mask in the file is not read
     if raster.sizes["band"] == 1:
         raster = raster.squeeze("band", drop=True)
     else:
