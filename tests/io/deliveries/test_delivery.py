@@ -24,9 +24,10 @@ from made_up_deliveries import (
     write_single,
     zipped,
 )
-from zlocus.core.errors import InputError
+from rpc_fixtures import write_image
+from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import SunDirection
-from zlocus.io.deliveries.delivery import is_delivery, open_delivery
+from zlocus.io.deliveries.delivery import describe, is_delivery, open_delivery
 from zlocus.io.scene_file import open_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -177,6 +178,20 @@ def test_a_table_of_dates_completes_and_corrects(taken, tmp_path):
     assert (nadir.name, fore.name) == ("20150607T080910", "20150607T081010")
     assert nadir.sun_direction == SunDirection(150.3, 50.8)
     assert fore.sun_direction is None
+
+
+def test_what_is_left_out_is_named(taken, tmp_path):
+    for shot in taken:
+        write_single(tmp_path, shot)
+    for number in range(5):
+        write_image(tmp_path / f"dem_{number}.tif", taken[0].grey)
+    (tmp_path / "order.pdf").write_bytes(b"%PDF")
+    assert describe(open_delivery(tmp_path)) == (
+        f"{tmp_path} holds 2 views. Left out: dem_0.tif, dem_1.tif, dem_2.tif and 2 more (has no RPC, in its tags or "
+        "beside it)."
+    )
+    with pytest.warns(ZlocusWarning, match="Left out: dem_0.tif"):
+        open_scene([tmp_path])
 
 
 def test_what_is_a_delivery(tmp_path, made):

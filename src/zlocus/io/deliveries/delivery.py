@@ -29,6 +29,8 @@ READERS: tuple[Reader, ...] = (
     stac_products, dimap_products, maxar_products, planet_products, gaofen_products, plain_images,
 )  # fmt: skip
 STAC_SUFFIXES = (".json", ".geojson")
+# Files that a note names at most for one reason.
+MAX_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -158,10 +160,18 @@ def _name_of(acquisition: Acquisition) -> str:
 
 
 def describe(delivery: Delivery) -> str:
-    """What was found, in one sentence."""
+    """What was found, and what is left out, in sentences."""
+    n_views = len(delivery.views)
     n_coloured = sum(view.partner is not None for view in delivery.views)
     colours = f", {n_coloured} of them with the colours of a multispectral image" if n_coloured else ""
-    aside = f"; {len(delivery.set_aside)} files are left out" if delivery.set_aside else ""
-    first = f" ({delivery.set_aside[0].path.name} {delivery.set_aside[0].reason})" if aside else ""
-    plural = "s" if len(delivery.views) != 1 else ""
-    return f"{delivery.path} holds {len(delivery.views)} view{plural}{colours}{aside}{first}."
+    held = f"{delivery.path} holds {n_views} view{'s' if n_views != 1 else ''}{colours}"
+    by_reason: dict[str, list[str]] = {}
+    for each in delivery.set_aside:
+        by_reason.setdefault(each.reason, []).append(each.path.name)
+    if not by_reason:
+        return f"{held}."
+    parts = []
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        parts.append(f"{', '.join(names[:MAX_NAMED])}{more} ({reason})")
+    return f"{held}. Left out: {'; '.join(parts)}."
