@@ -113,6 +113,8 @@ def test_a_file_that_does_not_say(tmp_path):
     ("fields", "expected"),
     [
         ({"cloudcover": "-999"}, Acquisition()),
+        ({"acquired": "2014-10-05 16:01 GMT"}, Acquisition(
+            OCTOBER, datetime.datetime(2014, 10, 5, 16, 1, tzinfo=datetime.UTC))),
         ({"cloud_percent": "30"}, Acquisition(cloud_cover=0.3)),
         ({"view_angle": "-4.5", "satellite_azimuth": "-90"}, Acquisition(off_nadir_deg=4.5, view_azimuth_deg=270.0)),
         ({"meansatel": "0", "satellite_azimuth": "720"}, Acquisition()),

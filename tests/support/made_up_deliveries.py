@@ -261,6 +261,29 @@ def _isd(shot: Shot, letters: str, rows: int, cols: int, rpc: RpcCoefficients, n
 """
 
 
+def geoeye_delivery(root: Path, taken: list[Shot]) -> Path:
+    """Products of GeoEye itself: pan and bgrn of each shot, and one text of metadata."""
+    root.mkdir(parents=True)
+    sections = []
+    for number, shot in enumerate(taken):
+        for kind, pixels, rpc in (("pan", shot.grey, shot.rpc), ("bgrn", shot.bands("BGRN"), shot.colour_rpc)):
+            write_image(root / f"po_1234567_{kind}_{number:03}0000.tif", pixels)
+            (root / f"po_1234567_{kind}_{number:03}0000_rpc.txt").write_text(rpc_txt(rpc))
+        sections.append(
+            f"Source Image ID: 20141005160{number}\nProduct Image ID: {number:03}\nSensor: GeoEye-1\n"
+            f"Nominal Collection Azimuth: {VIEW_AZIMUTH} degrees\n"
+            f"Nominal Collection Elevation: {VIEW_ELEVATION} degrees\n"
+            f"Sun Angle Azimuth: {SUN_AZIMUTH} degrees\nSun Angle Elevation: {SUN_ELEVATION} degrees\n"
+            f"Acquisition Date/Time: {shot.time:%Y-%m-%d %H:%M:%S} GMT\nPercent Cloud Cover: {100 * CLOUD:.0f}\n"
+        )
+    ruler = "=" * 40
+    (root / "po_1234567_metadata.txt").write_text(
+        f"Product Order Metadata\nCreation Date: 2014-11-01\nSensor Name: GeoEye-1\n{ruler}\nSource Image Metadata\n"
+        f"Number of Source Images: {len(taken)}\n" + "\n".join(sections) + f"{ruler}\nProduct Component Metadata\n"
+    )
+    return root
+
+
 def planet_delivery(root: Path, taken: list[Shot]) -> Path:
     """SkySat scenes: basic panchromatic and analytic images, unusable data masks, and metadata."""
     root.mkdir(parents=True)

@@ -35,9 +35,11 @@ CLOUD_SHARE = ("cloudcover", "cloud_cover")
 CLOUD_PERCENT = ("cloud_coverage", "cloudpercent", "cloud_percent", "nitf_piaimc_cloudcvr")
 SATELLITE = ("satid", "satellite_id")
 TIMES = ("firstlinetime", "acquired", "nitf_idatim")
-# Year, month and day, and hour, minute and second, with or without separators: 2014-10-05T16:01:38.25Z, 20141005160138,
-# 2014:10:05 16:01:38.
-TIME = re.compile(r"\s*(\d{4})[-:/]?(\d{2})[-:/]?(\d{2})(?:[T ]?(\d{2}):?(\d{2}):?(\d{2})(\.\d+)?)?", re.ASCII)
+# Year, month and day, and hour, minute and perhaps second, with or without separators: 2014-10-05T16:01:38.25Z,
+# 20141005160138, 2014:10:05 16:01.
+TIME = re.compile(
+    r"\s*(\d{4})[-:/]?(\d{2})[-:/]?(\d{2})(?:[T ]?(\d{2}):?(\d{2})(?::?(\d{2})(\.\d+)?)?(?!\d))?", re.ASCII
+)
 # Digital images are not older, and what a file says of a later day than tomorrow is a mistake.
 FIRST_YEAR = 1920
 
@@ -116,7 +118,7 @@ def time_in(text: str) -> tuple[datetime.date, datetime.datetime | None] | None:
             return None
         if found[4] is None:
             return day, None
-        hour, minute, second = (int(part) for part in found.groups()[3:6])
+        hour, minute, second = (int(part or 0) for part in found.groups()[3:6])
         clock = datetime.time(hour, minute, second, tzinfo=datetime.UTC)
     except ValueError:
         return None

@@ -16,6 +16,7 @@ from made_up_deliveries import (
     VIEW_ELEVATION,
     dimap_delivery,
     gaofen_delivery,
+    geoeye_delivery,
     maxar_delivery,
     nitf_delivery,
     planet_delivery,
@@ -39,6 +40,7 @@ VENDORS = {
     "maxar": (maxar_delivery, "WV03"),
     "maxar isd": (lambda root, taken: maxar_delivery(root, taken, isd=""), "WV03"),
     "maxar isd with a namespace": (lambda root, taken: maxar_delivery(root, taken, isd=NAMESPACE), "WV03"),
+    "geoeye": (geoeye_delivery, "GeoEye-1"),
     "planet": (planet_delivery, "SSC2"),
     "gaofen": (gaofen_delivery, "GF2-PMS1"),
     "stac": (stac_delivery, "WV03"),
@@ -91,7 +93,7 @@ def test_what_vendors_say_of_the_exposure(made, taken, vendor):
         assert said.sun_direction == SunDirection(SUN_AZIMUTH, pytest.approx(SUN_ELEVATION))
         assert said.view_azimuth_deg == pytest.approx(VIEW_AZIMUTH)
         assert said.cloud_cover == CLOUD
-        if vendor != "gaofen":
+        if vendor not in ("gaofen", "geoeye"):
             assert said.off_nadir_deg == OFF_NADIR
         if vendor != "planet":
             assert said.incidence_deg == pytest.approx(90 - VIEW_ELEVATION)

@@ -14,6 +14,7 @@ from zlocus.io.deliveries.acquisition_table import find_table, read_acquisition_
 from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Reader, SetAside
 from zlocus.io.deliveries.dimap_products import dimap_input, dimap_products
 from zlocus.io.deliveries.gaofen_products import gaofen_products
+from zlocus.io.deliveries.geoeye_products import geoeye_products
 from zlocus.io.deliveries.listing import files_in
 from zlocus.io.deliveries.maxar_products import maxar_input, maxar_products
 from zlocus.io.deliveries.pairing import ColourPartner, colour_partner
@@ -26,7 +27,7 @@ from zlocus.io.tiled_products import TIL_SUFFIX, is_tile_index
 
 # Readers of vendors, in the order in which they are asked. Files that one of them claims are not shown to the next.
 READERS: tuple[Reader, ...] = (
-    stac_products, dimap_products, maxar_products, planet_products, gaofen_products, plain_images,
+    stac_products, dimap_products, maxar_products, geoeye_products, planet_products, gaofen_products, plain_images,
 )  # fmt: skip
 STAC_SUFFIXES = (".json", ".geojson")
 # Files that a note names at most for one reason.

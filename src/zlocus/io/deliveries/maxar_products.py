@@ -2,7 +2,7 @@
 
 A product has a name such as `14OCT05160138-P1BS-500648062040_01_P001`. Its pixels are NAME.TIF or NAME.NTF, or tiles
 that NAME.TIL lists; NAME.IMD (text) or NAME.XML (image support data) says what they are, and NAME.RPB or NAME.XML holds
-the RPC. Products that GeoEye itself delivered have NAME_rpc.txt and a NAME_metadata.txt instead.
+the RPC. Products that GeoEye itself delivered have NAME_rpc.txt instead, see `geoeye_products`.
 
 Source: DigitalGlobe, Imagery Support Data Documentation (2014).
 """
