@@ -16,7 +16,7 @@ from zlocus.evaluation.alignment import best_shift
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.frame import Points
-from zlocus.evaluation.heights import read_heights
+from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.truth import truth_blocks
 
 N = 200
@@ -193,7 +193,7 @@ def plain_search(surface, truth, points):
     points, height = points.where(flat), truth.mean[flat]
 
     def spread_at(shift):
-        difference = points.heights(surface.bilinear, shift) - height
+        difference = points.heights(surface, HeightRaster.bilinear, shift) - height
         difference = difference[np.isfinite(difference)]
         return np.median(np.abs(difference - np.median(difference)))
 
@@ -230,3 +230,16 @@ def test_the_search_with_samples_finds_what_the_plain_search_finds(tmp_path, mon
     truth = truth_blocks(read_heights(moved(tmp_path / "r.tif", 120, (0, 0, 0))), 5.0, None)
     points = Points(truth.xy)
     assert best_shift(surface, truth, points) == plain_search(surface, truth, points)
+
+
+def test_a_search_that_runs_away_ends_and_determines_nothing(tmp_path):
+    # The surface is the reference 11 m farther east: on ground this smooth the spread falls all the way.
+    reference = moved(tmp_path / "r.tif", N, (0, 0, 0), valleys)
+    dsm = moved(tmp_path / "d.tif", N, (11, 0, 0.4), valleys)
+    found = evaluate(dsm, Comparison(reference)).found_shift
+    assert found.undetermined == "the differences spread less and less up to 8 m, as far as is searched"
+
+
+def valleys(x, y):
+    """Hills of 40 and 60 m from top to top."""
+    return 5 * np.sin(2 * np.pi * x / 60) + 5 * np.sin(2 * np.pi * y / 40)

@@ -195,7 +195,7 @@ def test_bad_input_is_said_in_one_sentence(tmp_path, hills):
         (InputError, "do not overlap", (far, good, {})),
         (InputError, "EPSG:4326.* do not overlap", (good, degrees, {})),
         (InputError, "has no height", (good, empty, {})),
-        (InputError, "nothing to align", (empty, good, {"align": True})),
+        (InputError, "holds no height at all, so nothing can be compared", (empty, good, {"align": True})),
         (InputError, "too few", (tiny, good, {})),
         (InputError, "leaves nothing", (good, good, {"margin_m": 100.0})),
         (ConfigError, "is negative", (good, good, {"margin_m": -1.0})),
@@ -232,7 +232,7 @@ def test_an_empty_surface_is_judged_not_refused(tmp_path, hills):
     result = evaluate(empty, Comparison(good))
     lines = evaluation_table(result).splitlines()
     assert "no error is known: no cell has a height in both the surface and the reference" in lines
-    assert "MVS3DM (single cells), absolute: completeness 0.00 %, median error -" in lines
+    assert "MVS3DM, absolute: completeness 0.00 %, median error -" in lines
     assert "aligned: there are no figures, because no cell has a height in both the surface and the reference" in lines
     assert "nan" not in "\n".join(lines)
     assert "no error is known" not in evaluation_table(evaluate(good, Comparison(good)))
@@ -333,7 +333,7 @@ def test_the_definitions_of_mvs3dm(tmp_path):
     assert result.mvs3dm.completeness == (98 - 10 - 3 - 1) / 98
     assert result.mvs3dm.median_error_m == pytest.approx(0.3, abs=1e-5)
     assert result.as_dict()["mvs3dm_completeness"] == result.mvs3dm.completeness
-    assert "MVS3DM (single cells), absolute: completeness 85.71 %, median error 0.300 m" in evaluation_table(result)
+    assert "MVS3DM, absolute: completeness 85.71 %, median error 0.300 m" in evaluation_table(result)
 
 
 def test_its_median_error_is_absolute_and_its_shift_removed(tmp_path, hills):

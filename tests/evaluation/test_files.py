@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -49,7 +50,7 @@ def test_the_folder_holds_figures_map_and_histogram(tmp_path, pair):
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in out.iterdir()) == sorted(files.NAMES)
     printed, kept = json.loads(result.stdout), json.loads((out / "evaluation.json").read_text())
-    of_all = ("command", "version", "exit_status", "out")  # entries of every command
+    of_all = ("command", "version", "exit_status", "out", "files")  # entries of every command
     assert kept == {"schema": 2} | {name: value for name, value in printed.items() if name not in of_all}
     assert printed["all"]["within_m"] == {"0.3": 0.375, "1": 0.75}
     assert printed["all"]["within"] == 0.375
@@ -122,7 +123,17 @@ def test_a_histogram_of_nothing_says_so(tmp_path, pair):
     empty = write(tmp_path / "empty.tif", np.full((N, N), np.nan, np.float32))
     figure = histogram_figure(evaluate(empty, Comparison(pair[1])))
     assert [text.get_text() for text in figure.axes[0].texts] == ["no height where the reference has one"]
-    assert run(empty, pair[1], "-o", tmp_path / "out").exit_code == 0
+
+
+def test_the_files_are_named(tmp_path, pair):
+    said = run(*pair, "-o", tmp_path / "out").stdout.splitlines()[-1]
+    assert said == f"{tmp_path / 'out'}: evaluation.json, error.tif, histogram.png written."
+    files = json.loads(run(*pair, "-o", tmp_path / "json", "--json").stdout)["files"]
+    assert all(Path(file).parent == tmp_path / "json" and Path(file).exists() for file in files)
+
+
+def test_a_comparison_shows_its_progress(pair):
+    assert run(*pair).stderr.startswith("Comparing: done in ")
 
 
 def test_a_failed_write_leaves_no_part(tmp_path, pair, monkeypatch):
@@ -133,7 +144,7 @@ def test_a_failed_write_leaves_no_part(tmp_path, pair, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
-    result = run(*pair, "-o", out, "--overwrite")
+    result = run(*pair, "-o", out, "--overwrite", "-q")
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
     assert "histogram.png cannot be written: No space left on device" in result.stderr
     # The figures of the evaluation before are gone: they are not those of the new map.
@@ -176,8 +187,11 @@ def test_the_contract_of_the_command_holds(pair):
     assert table[2].split()[:2] == ["all", "10000"]
     assert "within: share of all cells in error by less than 1 m; errors in m" in table
     assert any(line.startswith("aligned: removed first: ") for line in table)
-    # The table shows both kinds of figures whether or not the shift is asked for.
-    assert run(dsm, reference, "--margin", 5, "--align").stdout.splitlines() == table
+    # The table shows both kinds of figures whether or not the shift is asked for; the last line says what changes.
+    asked = run(dsm, reference, "--margin", 5, "--align").stdout.splitlines()
+    assert asked[:-1] == table[:-1]
+    assert table[-1].endswith("the absolute ones; --align or --coregister makes them the aligned ones")
+    assert asked[-1].endswith("the aligned ones, because of --align")
     several = run(dsm, reference, "--threshold", 1, "--threshold", 0.25).stdout.splitlines()
     thresholds = several[several.index("") + 2]
     assert thresholds.split() == ["cells", "complete", *["<", "1", "m", "<", "0.25", "m"] * 2]
@@ -203,13 +217,13 @@ def test_both_kinds_of_figures_are_in_every_output(tmp_path):
         assert title[1] == f"{other} errors: median {figures['median']:+z.3f} m, NMAD {figures['nmad']:.3f} m"
 
 
-def test_no_shift_is_no_failure_unless_it_is_asked_for(tmp_path, pair):
+def test_an_empty_surface_ends_with_a_sentence_and_writes_nothing(tmp_path, pair):
     empty = write(tmp_path / "empty.tif", np.full((N, N), np.nan, np.float32))
-    plain, asked = run(empty, pair[1]), run(empty, pair[1], "--align")
-    assert plain.exit_code == 0
-    assert "aligned: there are no figures, because no cell has a height in both" in plain.stdout
-    assert (asked.exit_code, len(asked.stderr.splitlines())) == (2, 1)
-    assert "has no height where the reference has one: nothing to align" in asked.stderr
+    plain, asked = run(empty, pair[1], "-o", tmp_path / "out", "-q"), run(empty, pair[1], "--align")
+    assert (plain.exit_code, asked.exit_code, len(asked.stderr.splitlines())) == (2, 2, 1)
+    assert plain.stderr == asked.stderr
+    assert "empty.tif holds no height at all, so nothing can be compared. See its quality.tif" in asked.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -33,3 +33,10 @@ def test_interpolated_heights_are_those_of_the_plain_formula():
     raster = HeightRaster(Path("z.tif"), z, from_origin(0, 13, 1, 1), None)
     xy = np.column_stack([rng.uniform(-2, 19, 3000), rng.uniform(-2, 15, 3000)])
     np.testing.assert_allclose(raster.bilinear(xy), [plainly_between(raster, *at) for at in xy], rtol=1e-12)
+
+
+def test_the_filled_cells_are_the_rows_and_columns_with_heights():
+    z = np.full((5, 7), np.nan)
+    assert HeightRaster(Path("z.tif"), z.copy(), from_origin(0, 5, 1, 1), None).filled_cells is None
+    z[1, 2] = z[3, 5] = 1.0
+    assert HeightRaster(Path("z.tif"), z, from_origin(0, 5, 1, 1), None).filled_cells == ((1, 3), (2, 5))

@@ -70,7 +70,7 @@ def test_what_is_not_known_is_a_dash_and_a_reason():
     ).splitlines()
     assert lines[2].split()[-5:] == ["-"] * 5
     assert "aligned: there are no figures, because the moon is full" in lines
-    assert not any(line.startswith("MVS3DM (single cells), aligned") for line in lines)
+    assert not any(line.startswith("MVS3DM, aligned") for line in lines)
 
 
 def test_a_height_alone_is_said_to_be_removed_alone():

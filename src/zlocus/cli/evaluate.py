@@ -10,7 +10,7 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
-from zlocus.core.errors import ConfigError
+from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.requests import EVALUATION_FILES, check_output
 
 DEFAULT_THRESHOLD_M = 1.0
@@ -106,12 +106,19 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate as compare
     from zlocus.evaluation.files import write_evaluation
-    from zlocus.evaluation.table import evaluation_table
+    from zlocus.evaluation.table import evaluation_table, main_figures_line
 
-    evaluation = compare(options.dsm, Comparison(options.reference, **arguments))
-    if options.out is not None:
-        write_evaluation(options.out, evaluation)
-    return Answer(evaluation_table(evaluation), evaluation.as_dict(), is_asked_for=True)
+    comparison = Comparison(options.reference, **arguments)
+    with console.progress.stage("Comparing"):
+        evaluation = compare(options.dsm, comparison)
+    if evaluation.nothing_compared is not None:
+        raise InputError(evaluation.nothing_compared)
+    text, values = f"{evaluation_table(evaluation)}\n{main_figures_line(evaluation)}", evaluation.as_dict()
+    if options.out is None:
+        return Answer(text, values, is_asked_for=True)
+    write_evaluation(options.out, evaluation)
+    files = [str(options.out / name) for name in EVALUATION_FILES]
+    return Answer(f"{text}\n{options.out}: {', '.join(EVALUATION_FILES)} written.", {**values, "files": files}, True)
 
 
 def check_not_input(out: Path, *inputs: Path | None) -> None:

@@ -40,7 +40,8 @@ def report(options: ReportOptions, console: Console) -> Answer:
     from zlocus.products.report.page import write_report
 
     comparison = None if options.reference is None else Comparison(options.reference, **arguments)
-    path = write_report(options.out, comparison)
+    with console.progress.stage("Report" if comparison is None else "Comparing, and making the report"):
+        path = write_report(options.out, comparison)
     link_all(options.out, console.progress)
     update_finished(options.out, (path.name, ITEM))
     return Answer(f"{path}: open it in a browser.", {"report": str(path)})

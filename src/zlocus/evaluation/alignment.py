@@ -17,6 +17,8 @@ from zlocus.evaluation.spread import SAMPLE_BLOCKS, HeightDifferences, Horizonta
 from zlocus.evaluation.truth import TruthBlocks
 
 MAX_SHIFT_M = 4
+# The smaller steps lead at most this far, east and north. Shifts of up to 6 m are found so.
+SEARCHED_M = 2 * MAX_SHIFT_M
 FIRST_STEP_M = 0.5
 LAST_STEP_M = 0.02
 # A shift is determined where moving the surface on by 4 m raises the spread by at least this share in every direction.
@@ -28,23 +30,22 @@ def best_shift(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Hor
     """Horizontal shift (east, north), m, at which the height differences spread least.
 
     The spread is the median absolute deviation over blocks without an edge. Whole metres up to 4 m are tried first,
-    then a pattern search halves its step down to about 0.02 m. points : centres of the blocks in the surface's CRS.
+    then a pattern search halves its step down to about 0.02 m, and ends `SEARCHED_M` away. points : centres of the
+    blocks in the surface's CRS.
 
     Raises
     ------
     InputError
-        The surface has no height to align.
+        No block without an edge has a height in the surface.
     """
     differences = HeightDifferences.of(surface, truth, points)
     shift = _best_shift(differences)
     if not len(differences.at(shift)):
-        raise nothing_to_align(surface)
+        raise InputError(
+            f"{surface.path} has no height at a block without an edge of the reference, so there is no shift to find. "
+            "Compare surfaces of the same ground."
+        )
     return shift
-
-
-def nothing_to_align(surface: HeightRaster) -> InputError:
-    """The error of a search for a shift where no cell has a height in both rasters."""
-    return InputError(f"{surface.path} has no height where the reference has one: nothing to align. Leave out --align.")
 
 
 def why_too_flat(truth: TruthBlocks) -> str | None:
@@ -62,9 +63,14 @@ def determined_shift(surface: HeightRaster, truth: TruthBlocks, points: Points) 
     if reason is not None:
         return reason
     differences = HeightDifferences.of(surface, truth, points)
+    too_few = f"fewer than {MIN_BLOCKS} blocks without an edge have a height in both"
+    if np.count_nonzero(differences.points.reaching(surface, math.hypot(SEARCHED_M, SEARCHED_M))) < MIN_BLOCKS:
+        return too_few
     shift = _best_shift(differences)
     if len(differences.at(shift)) < MIN_BLOCKS:
-        return f"fewer than {MIN_BLOCKS} blocks without an edge have a height in both"
+        return too_few
+    if max(map(abs, shift)) >= SEARCHED_M:
+        return f"the differences spread less and less up to {SEARCHED_M} m, as far as is searched"
     sample = differences.sample(SAMPLE_BLOCKS[1])
     least_around = min(sample.spread(moved) for moved in _around(shift, surface, points))
     if least_around <= (1 + MIN_SPREAD_RISE) * sample.spread(shift):
@@ -82,8 +88,8 @@ def _best_shift(differences: HeightDifferences) -> HorizontalShift:
         return best
     step = FIRST_STEP_M
     while step > LAST_STEP_M:
-        candidates = [(best[0] + u * step, best[1] + v * step) for u, v in itertools.product((-1, 0, 1), repeat=2)]
-        nearby = spreads.least(candidates)
+        around = ((best[0] + u * step, best[1] + v * step) for u, v in itertools.product((-1, 0, 1), repeat=2))
+        nearby = spreads.least(shift for shift in around if max(map(abs, shift)) <= SEARCHED_M)
         if nearby == best:
             step /= 2
         best = nearby

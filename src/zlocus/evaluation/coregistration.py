@@ -68,7 +68,7 @@ def coregister(surface: HeightRaster, truth: TruthBlocks, points: Points) -> Cor
     usable_points, height = points.where(usable), height[usable]
     shift, moved = np.zeros(2), np.inf
     for step in range(1, MAX_ITERATIONS + 1):
-        difference = usable_points.heights(surface.between_cells, shift) - height
+        difference = usable_points.heights(surface, HeightRaster.between_cells, shift) - height
         known = np.isfinite(difference)
         n = int(np.count_nonzero(known))
         if step == 1:

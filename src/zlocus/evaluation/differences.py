@@ -127,7 +127,7 @@ def _on_grid(surface: HeightRaster, reference: HeightRaster) -> FloatArray:
         points = points_on(surface, reference, frame, places(reference.transform, row + 0.5, col + 0.5))
         cell = surface.cells(points.xy)
         is_shared = is_shared or bool(((cell >= 0) & (cell < surface.z.shape)).all(axis=1).any())
-        out[row, col] = points.heights(surface.nearest)
+        out[row, col] = points.heights(surface, HeightRaster.nearest)
     if not is_shared:
         names = [f"{raster.path} ({_crs_name(raster)})" for raster in (reference, surface)]
         raise InputError(

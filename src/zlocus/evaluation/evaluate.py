@@ -14,8 +14,8 @@ from pyproj import CRS
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.accuracy import Accuracy
-from zlocus.evaluation.alignment import nothing_to_align
 from zlocus.evaluation.comparison import Comparison
+from zlocus.evaluation.filling import share_ground, why_nothing_compared
 from zlocus.evaluation.frame import Points, frame_of, points_on
 from zlocus.evaluation.heights import HeightRaster, read_heights
 from zlocus.evaluation.mvs3dm import Mvs3dm, mvs3dm_figures
@@ -42,7 +42,8 @@ class Evaluation:
 
     absolute_accuracy : as the surface lies. threshold_m : limit of `within`. aligned_accuracy : after the shift was
     removed; None where no shift is known. found_shift : the shift that is removed for the aligned figures; None where
-    none is known. no_shift : why not, as a clause. is_aligned : whether the aligned figures are the main ones, of which
+    none is known. no_shift : why not, as a clause. nothing_compared : why no error is known, as a sentence with advice;
+    None where one is. is_aligned : whether the aligned figures are the main ones, of which
     the error map is. vertical_datums : of surface and reference as their files state them, None where one does not.
     assumed_datum, assumed_crs : what had to be assumed about the vertical datum and the coordinates, as sentences.
     geoid_added_to : raster to whose heights the geoid's were added. places_per_block : rows and columns of places in a
@@ -55,6 +56,7 @@ class Evaluation:
     aligned_accuracy: Accuracy | None = None
     found_shift: Shift | None = None
     no_shift: str | None = None
+    nothing_compared: str | None = None
     is_aligned: bool = False
     vertical_datums: tuple[str | None, str | None] = (None, None)
     assumed_datum: str | None = None
@@ -184,6 +186,11 @@ def evaluate_rasters(
 
     errors = truth.errors(heights_without(None, surface, points))
     aligned = _aligned(surface, truth, points, comparison)
+    nothing_compared = None
+    if aligned is None and not np.isfinite(errors).any():
+        nothing_compared = why_nothing_compared(surface, reference, truth, points, comparison.margin_m)
+        if comparison.removes_shift:
+            raise InputError(nothing_compared)
     is_aligned = comparison.removes_shift and aligned is not None
     return Evaluation(
         absolute_accuracy=accuracy(errors, None),
@@ -191,6 +198,7 @@ def evaluate_rasters(
         aligned_accuracy=None if aligned is None else accuracy(aligned.errors, aligned.shift),
         found_shift=None if aligned is None else aligned.shift,
         no_shift=NOTHING_IN_COMMON if aligned is None else None,
+        nothing_compared=nothing_compared,
         is_aligned=is_aligned,
         vertical_datums=compared.datums,
         assumed_datum=compared.assumed,
@@ -209,20 +217,13 @@ class AlignedErrors(NamedTuple):
 
 
 def _aligned(surface: HeightRaster, truth: TruthBlocks, points: Points, comparison: Comparison) -> AlignedErrors | None:
-    """Errors after the shift was removed; None where there is none, because no cell has a height in both rasters.
-
-    Raises
-    ------
-    InputError
-        The comparison asks for the removal of a shift, and there is none.
-    """
+    """Errors after the shift was removed; None where there is none, because no cell has a height in both rasters."""
     shift = horizontal_shift(surface, truth, points, comparison)
     # The height is measured as the horizontal shift was: between cells.
-    z = points.heights(surface.nearest if shift.undetermined else surface.bilinear, shift.enu_m[:2])
+    look_up = HeightRaster.nearest if shift.undetermined else HeightRaster.bilinear
+    z = points.heights(surface, look_up, shift.enu_m[:2])
     errors = truth.errors(z)
     if not np.isfinite(errors).any():
-        if comparison.removes_shift:
-            raise nothing_to_align(surface)
         return None
     shift = replace(shift, up_m=float(np.nanmedian(errors)))
     return AlignedErrors(shift, truth.errors(heights_without(shift, surface, points)))
@@ -230,7 +231,7 @@ def _aligned(surface: HeightRaster, truth: TruthBlocks, points: Points, comparis
 
 def _check_overlap(surface: HeightRaster, reference: HeightRaster, points: Points) -> None:
     cell = surface.cells(points.xy)
-    if not ((cell >= 0) & (cell < surface.z.shape)).all(axis=1).any():
+    if not ((cell >= 0) & (cell < surface.z.shape)).all(axis=1).any() and not share_ground(surface, reference):
         raise InputError(
             f"{surface.path} ({_crs_name(surface)}) and {reference.path} ({_crs_name(reference)}) do not overlap. "
             "Check the CRS of both."

@@ -29,7 +29,12 @@ HALF_STEP_M = 5.0
 MIN_COARSER_RATIO, RATIO_TOLERANCE = 2.0, 0.01
 # Maximum number of places along a side of a larger cell; in cells of 90 m they are 3 m apart.
 MAX_PLACES_PER_SIDE = 32
-PLACES_AT_A_TIME = 1_000_000
+# So many that their heights stay in the cache of a core; ten times as many take twice as long.
+PLACES_AT_A_TIME = 65_536
+# Allowance for rounding where points are sought that touch a surface, cells of it.
+REACH_SLACK_CELLS = 1.0
+# Looks heights (n,) up at places (n, 2) of a raster.
+LookUp = Callable[[HeightRaster, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class Areas:
         down, across = ((np.arange(n) + 0.5) / n - 0.5 for n in self.shape)
         return np.column_stack([np.tile(across, len(down)), np.repeat(down, len(across))])
 
-    def offsets(self, part: slice) -> FloatArray:
+    def offsets(self, part: NDArray[np.int64]) -> FloatArray:
         """Offsets (n, k, 2) of the places from some of the points, in x and y; (k, 2) where all areas are alike."""
         steps, (across, down) = self.steps if self.steps.ndim == 2 else self.steps[part], self.places.T[..., None]
         return np.asarray(steps[..., None, :, 0] * across + steps[..., None, :, 1] * down)
@@ -68,26 +73,47 @@ class Points:
     areas: Areas | None = None
 
     def heights(
-        self, sample: Callable[[FloatArray], FloatArray], shift: Sequence[float] | FloatArray | None = None
+        self, surface: HeightRaster, look_up: LookUp, shift: Sequence[float] | FloatArray | None = None
     ) -> FloatArray:
-        """Heights (n,) m at the points, shifted by (east, north) m, or their means over the areas.
+        """Heights (n,) m of a surface at the points, shifted by (east, north) m, or their means over the areas.
 
-        sample : returns heights at places (n, 2), NaN where there is none. A mean is taken over the places that have a
-        height; it is NaN where fewer than half of them have one.
+        look_up : method of `HeightRaster` that returns heights at places (n, 2), NaN where there is none. A mean is
+        taken over the places that have a height; it is NaN where fewer than half of them have one.
         """
         xy = self.xy if shift is None else self.moved(shift)
         if self.areas is None:
-            return sample(xy)
-        areas, places = self.areas, self.areas.places
+            return look_up(surface, xy)
         means = np.full(len(xy), np.nan)
+        # Elsewhere no place has a height. A surface often fills few of the cells of a reference.
+        reaching = np.flatnonzero(self.reaching(surface, shift=shift))
+        areas, places = self.areas, self.areas.places
         n_at_a_time = max(1, PLACES_AT_A_TIME // len(places))
-        for first in range(0, len(xy), n_at_a_time):
-            part = slice(first, first + n_at_a_time)
-            z = sample((xy[part, None] + areas.offsets(part)).reshape(-1, 2)).reshape(-1, len(places))
+        for first in range(0, len(reaching), n_at_a_time):
+            part = reaching[first : first + n_at_a_time]
+            z = look_up(surface, (xy[part, None] + areas.offsets(part)).reshape(-1, 2)).reshape(-1, len(places))
             n_known = np.isfinite(z).sum(axis=1)
             enough = 2 * n_known >= len(places)
-            means[part][enough] = np.nansum(z[enough], axis=1) / n_known[enough]
+            means[part[enough]] = np.nansum(z[enough], axis=1) / n_known[enough]
         return means
+
+    def reaching(
+        self, surface: HeightRaster, by_m: float = 0.0, shift: Sequence[float] | FloatArray | None = None
+    ) -> NDArray[np.bool_]:
+        """Whether points (n,), or their areas, may touch a height of a surface after a shift or one farther by `by_m`.
+
+        It is True too where they touch the rectangle of the surface's cells that have heights, or nearly so.
+        """
+        if surface.filled_cells is None:
+            return np.zeros(len(self.xy), bool)
+        inverse = ~surface.transform
+        cells = np.array([[inverse.d, inverse.e], [inverse.a, inverse.b]])
+        metre = np.eye(2) if self.per_metre is None else self.per_metre
+        reach = REACH_SLACK_CELLS + by_m * np.abs(cells @ metre).sum(axis=-1)
+        if self.areas is not None:
+            reach = reach + np.abs(cells @ self.areas.steps).sum(axis=-1) / 2
+        first, last = np.array(surface.filled_cells).T
+        cell = surface.cells(self.xy if shift is None else self.moved(shift))
+        return np.asarray(((cell >= first - reach) & (cell <= last + 1 + reach)).all(axis=1))
 
     def moved(self, shift: Sequence[float] | FloatArray) -> FloatArray:
         """Coordinates (n, 2) of the points, shifted by (east, north) m of the frame."""

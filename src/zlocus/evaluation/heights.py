@@ -65,42 +65,72 @@ class HeightRaster:
 
     def nearest(self, xy: FloatArray) -> FloatArray:
         """Height (n,) m of the cell that contains each point; NaN outside. xy : (n, 2) in the raster's CRS."""
-        cell = np.floor(self.cells(xy)).astype(int)
-        inside = np.all((cell >= 0) & (cell < self.z.shape), axis=1)
-        z = np.full(len(xy), np.nan)
-        z[inside] = self.z[cell[inside, 0], cell[inside, 1]]
-        return z
+        return self._in_cells(*self._row_col(xy))
 
     def bilinear(self, xy: FloatArray) -> FloatArray:
         """Height (n,) m interpolated between four cell centres; as `nearest` where one of the four has no height."""
-        z = self.between_cells(xy)
-        missing = ~np.isfinite(z)
-        z[missing] = self.nearest(xy[missing])
+        row, col = self._row_col(xy)
+        z = self._between(row, col)
+        missing = np.isnan(z)
+        if missing.any():
+            z[missing] = self._in_cells(row[missing], col[missing])
         return z
 
     def between_cells(self, xy: FloatArray) -> FloatArray:
         """Height (n,) m interpolated between four cell centres; NaN where one of the four has no height."""
-        cell = self.cells(xy) - 0.5
-        corner = np.floor(cell)
-        down, right = (cell - corner).T
-        row, col = corner.astype(np.int64).T
-        rows, cols = self.z.shape
-        inside = (row >= 0) & (row < rows - 1) & (col >= 0) & (col < cols - 1)
-        first, z = np.where(inside, row * cols + col, 0), self.z.ravel()
-        upper = z.take(first) * (1 - right) + z.take(first + 1) * right
-        lower = z.take(first + cols) * (1 - right) + z.take(first + (cols + 1)) * right
-        return np.where(inside, upper * (1 - down) + lower * down, np.nan)
+        return self._between(*self._row_col(xy))
 
     def cells(self, xy: FloatArray) -> FloatArray:
         """Fractional row and column (n, 2) of points (n, 2), from the outer corner of the first cell.
 
         Points that are not finite get a place outside the raster.
         """
+        return np.column_stack(self._row_col(xy))
+
+    @cached_property
+    def filled_cells(self) -> tuple[tuple[int, int], tuple[int, int]] | None:
+        """First and last row, first and last column with a height; None where there is no height."""
+        is_filled = np.isfinite(self.z)
+        if not is_filled.any():
+            return None
+        rows, cols = (np.flatnonzero(is_filled.any(axis=axis)) for axis in (1, 0))
+        return (int(rows[0]), int(rows[-1])), (int(cols[0]), int(cols[-1]))
+
+    def _row_col(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Fractional rows and columns (n,) of points, see `cells`."""
         inverse = ~self.transform
         x, y = xy[:, 0], xy[:, 1]
         col = inverse.a * x + inverse.b * y + inverse.c
         row = inverse.d * x + inverse.e * y + inverse.f
-        return np.asarray(np.nan_to_num(np.column_stack([row, col]), nan=OUTSIDE, posinf=OUTSIDE, neginf=OUTSIDE))
+        unknown = ~(np.isfinite(row) & np.isfinite(col))
+        if unknown.any():
+            row, col = (np.where(np.isfinite(place), place, OUTSIDE) for place in (row, col))
+        return row, col
+
+    def _in_cells(self, row: FloatArray, col: FloatArray) -> FloatArray:
+        """Heights (n,) m of the cells that contain fractional rows and columns; NaN outside."""
+        rows, cols = self.z.shape
+        row, col = np.floor(row), np.floor(col)
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        z = np.full(len(row), np.nan)
+        z[inside] = self.z[row[inside].astype(np.int64), col[inside].astype(np.int64)]
+        return z
+
+    def _between(self, row: FloatArray, col: FloatArray) -> FloatArray:
+        """Heights (n,) m between four cell centres, at fractional rows and columns; see `between_cells`."""
+        row, col = row - 0.5, col - 0.5
+        top, left = np.floor(row), np.floor(col)
+        down, right = row - top, col - left
+        rows, cols = self.z.shape
+        inside = (top >= 0) & (top < rows - 1) & (left >= 0) & (left < cols - 1)
+        all_inside, z = bool(inside.all()), self.z.ravel()
+        first = top * cols + left
+        first = (first if all_inside else np.where(inside, first, 0)).astype(np.int64)
+        left_share = 1 - right
+        upper = z.take(first) * left_share + z.take(first + 1) * right
+        lower = z.take(first + cols) * left_share + z.take(first + (cols + 1)) * right
+        between = upper * (1 - down) + lower * down
+        return between if all_inside else np.where(inside, between, np.nan)
 
 
 def read_heights(path: Path) -> HeightRaster:

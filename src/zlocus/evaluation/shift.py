@@ -82,7 +82,7 @@ def heights_without(shift: Shift | None, surface: HeightRaster, points: Points) 
     Where there is no horizontal shift, the surface is looked up as it lies, in the cell that holds the point.
     """
     if shift is None:
-        return points.heights(surface.nearest)
+        return points.heights(surface, HeightRaster.nearest)
     if not shift.is_horizontal:
-        return points.heights(surface.nearest) - shift.up_m
-    return points.heights(surface.bilinear, (shift.east_m, shift.north_m)) - shift.up_m
+        return points.heights(surface, HeightRaster.nearest) - shift.up_m
+    return points.heights(surface, HeightRaster.bilinear, (shift.east_m, shift.north_m)) - shift.up_m

@@ -44,7 +44,7 @@ class HeightDifferences:
 
     def at(self, shift: HorizontalShift) -> FloatArray:
         """Surface less reference (n,) m in the k <= n blocks where both have a height, the shift removed."""
-        difference = self.points.heights(self.surface.bilinear, shift) - self.heights
+        difference = self.points.heights(self.surface, HeightRaster.bilinear, shift) - self.heights
         return difference[np.isfinite(difference)]
 
     def spread(self, shift: HorizontalShift) -> float:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from zlocus.evaluation.accuracy import Accuracy
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.mvs3dm import Mvs3dm
-from zlocus.evaluation.shift import Shift
+from zlocus.evaluation.shift import SEARCH, Shift
 from zlocus.evaluation.slopes import UNKNOWN
 from zlocus.evaluation.statistics import ErrorStatistics
 
@@ -17,6 +17,8 @@ KINDS = ("absolute", "aligned")
 ERROR_COLUMNS = {"median": "median", "NMAD": "nmad", "RMSE": "rmse", "LE90": "le90", "LE95": "le95"}
 # So that a line of text stays below 100 characters.
 TEXT_ERROR_COLUMNS = ("median", "NMAD", "RMSE", "LE90")
+# Shares closer than this to 0 or 1 would be shown as 0.00 or 100.00 %.
+HALF_OF_LAST_DIGIT = 0.5e-4
 COLUMN_GAP, KIND_GAP = " ", "   "
 
 
@@ -101,7 +103,14 @@ def _figures(statistics: ErrorStatistics | None, thresholds: Sequence[float], er
 
 
 def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.2f} %"
+    """A share with two decimals, of which 0 and 100 are exact; `-` where it is not known."""
+    if math.isnan(share):
+        return "-"
+    if 0 < share < HALF_OF_LAST_DIGIT:
+        return "< 0.01 %"
+    if 1 - HALF_OF_LAST_DIGIT <= share < 1:
+        return "> 99.99 %"
+    return f"{100 * share:.2f} %"
 
 
 def _band_name(name: str) -> str:
@@ -118,10 +127,9 @@ def notes(evaluation: Evaluation) -> Iterator[str]:
         yield f"within: share of all cells in error by less than {evaluation.threshold_m:g} m; errors in m"
     yield "absolute: the surface as it lies"
     yield from aligned_lines(evaluation)
-    if evaluation.absolute_accuracy.mvs3dm is not None:
-        yield f"MVS3DM (single cells), absolute: {_mvs3dm(evaluation.absolute_accuracy.mvs3dm)}"
-    if evaluation.aligned_accuracy is not None and evaluation.aligned_accuracy.mvs3dm is not None:
-        yield f"MVS3DM (single cells), aligned: {_mvs3dm(evaluation.aligned_accuracy.mvs3dm)}"
+    yield from _mvs3dm_lines(evaluation)
+    if UNKNOWN in evaluation.slope_statistics:
+        yield f"{_band_name(UNKNOWN)}: a neighbour of the cell has no height in the reference, or lies outside of it"
     if evaluation.places_per_block is not None:
         down, across = evaluation.places_per_block
         yield (
@@ -153,6 +161,24 @@ def shift_text(shift: Shift) -> str:
     known = "" if shift.sigma_m is None else f", sigma {shift.sigma_m:.3f} m"
     found_by = "" if shift.steps is None else f" ({shift.method}, {shift.steps} steps{known})"
     return f"{shift.east_m:+z.3f} m east, {shift.north_m:+z.3f} m north, {shift.up_m:+z.3f} m up{found_by}"
+
+
+def main_figures_line(evaluation: Evaluation) -> str:
+    """Which of the two kinds are the main figures, and which option decides it."""
+    main = "main figures (of files and JSON):"
+    if evaluation.shift is None:
+        return f"{main} the absolute ones; --align or --coregister makes them the aligned ones"
+    method = evaluation.shift.method
+    return f"{main} the aligned ones, because of {'--align' if method == SEARCH else f'--coregister {method}'}"
+
+
+def _mvs3dm_lines(evaluation: Evaluation) -> Iterator[str]:
+    aligned = None if evaluation.aligned_accuracy is None else evaluation.aligned_accuracy.mvs3dm
+    for kind, mvs3dm in zip(KINDS, (evaluation.absolute_accuracy.mvs3dm, aligned), strict=True):
+        if mvs3dm is not None:
+            yield f"MVS3DM, {kind}: {_mvs3dm(mvs3dm)}"
+    if evaluation.absolute_accuracy.mvs3dm is not None:
+        yield "MVS3DM: as that benchmark counts, single cells within 1 m, and the median of absolute errors"
 
 
 def _mvs3dm(mvs3dm: Mvs3dm) -> str:
