@@ -22,6 +22,7 @@ from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.matching.ground_pixels import (
     ReducedImage,
+    check_cells_in_overlap,
     check_resolution,
     common_pixel,
     default_cell,
@@ -155,3 +156,11 @@ def test_an_image_at_a_third_of_the_others_resolution(shared_data, tmp_path):
     found = evaluate(tmp_path / "out" / "dsm.tif", comparison).statistics.as_dict()
     assert found["completeness"] > LEAST_COMPLETE
     assert found["completeness"] - found["within_m"]["10"] < MOST_FAR_OFF
+
+
+def test_cells_must_leave_room_for_a_window_in_the_overlap():
+    shared = (0.0, 0.0, 200.0, 90.0)
+    check_cells_in_overlap(30.0, 3, shared, 0.5, "--resolution")
+    says = r"--resolution 31 m .* 3 x 3 cells, which are 93 m wide, .* 200 x 90 m of ground\. Ask for less than 30 m"
+    with pytest.raises(ConfigError, match=says):
+        check_cells_in_overlap(31.0, 3, shared, 0.5, "--resolution")

@@ -145,3 +145,8 @@ def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
     assert np.hypot(*(parallax_rate(views[0], 438.0) - parallax_rate(views[1], 438.0))) < 0.02
     step = height_step(tuple(views), 438.0, 0.2, 0.5)
     assert step == pytest.approx(0.5 * 0.208 / (2.0 * np.tan(np.deg2rad(15.0))), rel=0.05)
+
+
+def test_large_cells_do_not_make_images_look_along_one_line():
+    views = (view("a", 10), view("b", -10))
+    assert height_step(views, 50.0, 5000.0, 0.5) == pytest.approx(2500 / (2 * np.tan(np.deg2rad(10))), rel=1e-3)

@@ -189,6 +189,13 @@ def test_what_is_doubtful(residual, shift, outside, said):
         assert doubt.is_grave == (outside > 0)
 
 
+def test_cameras_that_nobody_corrected_are_not_said_to_be_off_after_a_correction():
+    off = doubts_about([View("a")], [2.0], [(0.0, 0.0)], np.full(9, 50.0), is_corrected=False)
+    (sentence,) = (doubt.sentence for doubt in off)
+    assert sentence.startswith("a: its tie points lie 2.00 px off with the camera as delivered (median)")
+    assert "after the correction" not in sentence
+
+
 def test_one_image_far_off_does_not_move_the_others():
     """Four images that a translation of the ground moves in different directions; the third is off by 200 px."""
     rng = np.random.default_rng(2)

@@ -37,7 +37,7 @@ def test_the_plan_of_a_surface_is_that_of_its_run(pair, tmp_path):
     assert values["plan"]["tiles"] == record["plan"]["tiles"]
     assert (values["plan"]["is_finished"], values["plan"]["finished_tiles"]) == (False, 0)
     rows, cols = record["grid"]["shape"]
-    assert f"Surface: {rows} x {cols} cells of 0.5 m" in dry.text
+    assert f"Surface: {rows} rows x {cols} columns of 0.5 m in EPSG:" in dry.text
     assert "Nothing was written." in dry.text
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
     again = plan_dsm(request, CONFIG, SilentProgress())

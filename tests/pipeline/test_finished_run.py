@@ -188,11 +188,11 @@ def test_a_program_that_looks_at_a_geopackage_changes_no_product(images, out, no
 def test_another_run_is_refused_and_what_differs_is_said(images, out, no_matching, monkeypatch, tmp_path):
     before = state(out)
     for more, says in (
-        ({"heights": (20.0, 80.0)}, r"request\.heights was \[25\.0, 80\.0\] there and is \[20\.0, 80\.0\] now"),
-        ({"config": RunConfig()}, r"options\.pyramid\.tile was 80 there and is"),
+        ({"heights": (20.0, 80.0)}, r"--heights was 25\.0 80\.0 there and is 20\.0 80\.0 now"),
+        ({"config": RunConfig()}, r"the option pyramid\.tile was 80 there and is"),
         (
             {"config": replace(SMALL_TILES, products=ProductOptions(sun_azimuth_deg=90.0))},
-            "options.products.sun_azimuth",
+            "the option products.sun_azimuth",
         ),
         ({"resume": False}, r"holds this run, already finished, which --no-resume asks not to take.*add --overwrite"),
     ):
@@ -201,7 +201,7 @@ def test_another_run_is_refused_and_what_differs_is_said(images, out, no_matchin
         assert "another run" in str(refused.value) or "--no-resume" in str(refused.value)
     with monkeypatch.context() as patch:
         patch.setattr(zlocus.pipeline.fingerprint, "versions_record", lambda: {"zlocus": "0"})
-        with pytest.raises(OutputError, match="another run: versions"):
+        with pytest.raises(OutputError, match="another run: the version of"):
             asked(images, out)
     others = tuple(Path(shutil.copy(path, tmp_path)) for path in images("sine").inputs)
     with pytest.raises(OutputError, match=r"another run: .*nadir\.tif is missing"):
@@ -357,7 +357,7 @@ def test_the_first_moments_of_another_run_do_not_open_a_folder(images, out):
         pass
     assert (out / FOLDER / MANIFEST).exists()
     before = state(out)
-    with pytest.raises(OutputError, match=r"another run: request\.heights"):
+    with pytest.raises(OutputError, match=r"another run: --heights"):
         asked(images, out, heights=(20.0, 80.0))
     (out / FINISHED).unlink()
     with pytest.raises(OutputError, match=r"another run \(run\.json, dsm\.tif\)"):
@@ -390,7 +390,9 @@ ASKED = {"crs": "EPSG:32632", "resolution": GSD_M, "heights": HEIGHTS, "bounds":
 
 def test_a_match_into_a_folder_that_holds_another_run_is_refused(images, out):
     before = state(out)
-    with pytest.raises(OutputError, match=r"another run: request\.heights was .* add --overwrite"):
+    with pytest.raises(
+        OutputError, match=r"another run: --heights was .* add --overwrite \(in Python: overwrite=True\)"
+    ):
         zlocus.match(*images("sine").inputs, out=out, config=SMALL_TILES, **ASKED | {"heights": (20.0, 80.0)})
     assert changed(before, out) == set()
     other = ASKED | {"heights": (20.0, 80.0)}

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from calibration_scenes import block_ground, calibrated, crossing_block, flat_block, options_with
+from zlocus.core.progress import SilentProgress
 from zlocus.orientation import bundle_adjustment
-from zlocus.pipeline.messages import self_calibration_sentences
+from zlocus.orientation.plausibility import ExcludedImage
+from zlocus.pipeline.messages import note_orientation, self_calibration_sentences, what_was_applied
 from zlocus.products.orientation import corrections_record
 
 
@@ -48,3 +51,41 @@ def test_what_was_found_is_said_with_its_standard_deviation():
 
 def test_without_a_bundle_adjustment_nothing_is_said():
     assert self_calibration_sentences(SimpleNamespace(bundle_adjustment=None, views=[])) == []
+
+
+class Notes(SilentProgress):
+    def __init__(self):
+        self.said = []
+
+    def note(self, sentence):
+        self.said.append(sentence)
+
+
+def oriented(model="shift", shift=(2.3, 0.6), n_refined=211, n=236, excluded=()):
+    views = [SimpleNamespace(name=name, shift_px=shift) for name in ("a", "b")]
+    return SimpleNamespace(
+        views=views, model=model, xyz=np.zeros((n, 3)), n_refined=n_refined, refined_xyz=np.zeros((n_refined, 3)),
+        bundle_adjustment=None, excluded_images=tuple(ExcludedImage(name, "no ties.") for name in excluded), doubts=(),
+    )  # fmt: skip
+
+
+def test_the_pointing_is_corrected_from_the_ties_that_were_refined():
+    said = what_was_applied(oriented())
+    assert said.startswith("Pointing corrected from 211 tie points (25 more, less exact ones, tell heights only), px")
+    assert "from 211 tie points, px" in what_was_applied(oriented(n=211))
+
+
+def test_without_a_request_no_correction_is_said_to_be_missing():
+    nothing = (0.0, 0.0)
+    assert what_was_applied(oriented("none", nothing)) == "Cameras used as delivered: no correction was asked for."
+    assert what_was_applied(oriented("shift", nothing)).startswith("Pointing not corrected: ")
+
+
+def test_nothing_is_said_of_images_where_none_are_left_to_match():
+    for has_heights, n in ((True, 0), (False, 3)):
+        notes = Notes()
+        note_orientation(oriented(excluded=("a", "b")), notes, has_heights)
+        assert len(notes.said) == n
+    notes = Notes()
+    note_orientation(oriented(), notes, has_heights=True)
+    assert len(notes.said) == 1

@@ -369,7 +369,7 @@ def test_what_was_changed_meanwhile_is_said(images, tmp_path, monkeypatch):
     n = n_finished(tmp_path / "out")
     with pytest.raises(OutputError, match=r"holds 3 finished tiles of another run: request\.heights was"):
         run(copied, tmp_path / "out", SMALL_TILES, heights=(20.0, 80.0))
-    with pytest.raises(OutputError, match=r"options\.pyramid\.tile was 80 there and is"):
+    with pytest.raises(OutputError, match=r"the option pyramid\.tile was 80 there and is"):
         run(copied, tmp_path / "out")
     os.utime(copied[1])
     with pytest.raises(OutputError, match=rf"{copied[1].name} has changed since"):

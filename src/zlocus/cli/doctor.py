@@ -11,7 +11,7 @@ import typer
 from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
 from zlocus.cli.console import Console
-from zlocus.cli.shared_options import ConfigFile, Crs, Inputs, Resolution, Settings, TieHeights
+from zlocus.cli.shared_options import Bounds, ConfigFile, Crs, Inputs, Resolution, Settings, TieHeights
 from zlocus.core.requests import DoctorRequest, check_output
 
 EXIT_WILL_FAIL = 2
@@ -27,6 +27,7 @@ class DoctorOptions:
     ] = None
     resolution: Resolution = None
     crs: Crs = None
+    bounds: Bounds = None
     heights: TieHeights = None
     workers: Annotated[int, typer.Option(help="Tiles worked on at a time in the planned run.", metavar="N")] = 1
     memory: Annotated[float | None, typer.Option(help="Memory limit of the planned run, GB.", metavar="GB")] = None
@@ -38,7 +39,7 @@ def doctor(options: DoctorOptions, console: Console) -> Answer:
     """Check inputs, overlap, tie points and memory before a run."""
     request = DoctorRequest(
         inputs=tuple(options.inputs), out=options.out, resolution=options.resolution, crs=options.crs,
-        heights=options.heights, workers=options.workers, memory_gb=options.memory,
+        bounds=options.bounds, heights=options.heights, workers=options.workers, memory_gb=options.memory,
     )  # fmt: skip
     if request.out is not None:
         # No run writes a file of the same name, so the folder may hold a run.

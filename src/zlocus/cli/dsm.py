@@ -191,8 +191,7 @@ def dsm(options: DsmOptions, console: Console) -> Answer:
     from zlocus.pipeline.dsm import run_dsm
 
     result = run_dsm(request, config, console.progress)
-    state = "already finished, " if result.was_finished else ""
     return Answer(
-        f"{result.out}: {state}{100 * result.coverage:.1f} % of the cells seen by two images or more have a height.",
+        result.sentence,
         {"coverage": result.coverage, "was_finished": result.was_finished},
     )

@@ -103,9 +103,8 @@ def assemble(options: TilesAssembleOptions, console: Console) -> Answer:
     from zlocus.pipeline.array_jobs import assemble_tasks
 
     result = assemble_tasks(options.out, options.partial, console.progress)
-    state = "already finished, " if result.was_finished else ""
     return Answer(
-        f"{result.out}: {state}{100 * result.coverage:.1f} % of the cells seen by two images or more have a height.",
+        result.sentence,
         {"coverage": result.coverage, "was_finished": result.was_finished},
     )
 

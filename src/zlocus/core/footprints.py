@@ -179,6 +179,18 @@ def shared_ground(scene: Scene, z_range: tuple[float, float]) -> Bounds:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
+def shared_area(scene: Scene, z: float) -> Any:
+    """The ground that two views or more see at height z (m), as a shapely geometry, which may be empty.
+
+    Footprints are taken as convex.
+    """
+    from shapely import MultiPoint, intersection, union_all
+
+    hulls = np.array([MultiPoint(footprint(view, z)).convex_hull for view in scene.views])
+    first, second = overlapping_pairs(hulls).T
+    return union_all(intersection(hulls[first], hulls[second]))
+
+
 def area_to_match(scene: Scene, z_range: tuple[float, float], ties: FloatArray) -> Bounds:
     """Bounds (xmin, ymin, xmax, ymax), m, of the area to match.
 

@@ -26,6 +26,8 @@ RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "
 # Files of a demo: the first marks its folder; the last holds the accuracy against the truth and ends the demo.
 DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
 # The record of a finished surface: everything that it depends on, and the checksums of its products.
+# What to do about a folder that holds another result.
+OTHER_FOLDER = "Choose another folder, or add --overwrite (in Python: overwrite=True)."
 FINISHED = "finished.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm", "gc3")
@@ -349,7 +351,7 @@ class RankRequest:
 class DoctorRequest:
     """A run to be looked at before it is made. `None` means: not given, to be found, and of `out`: nothing is written.
 
-    inputs, resolution, crs, heights, workers, memory_gb : as in `DsmRequest`.
+    inputs, resolution, crs, heights, bounds, workers, memory_gb : as in `DsmRequest`.
 
     Raises
     ------
@@ -366,11 +368,13 @@ class DoctorRequest:
     heights: tuple[float, float] | None = None
     workers: int = 1
     memory_gb: float | None = None
+    bounds: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         check_inputs(self.inputs)
         check_positive("--resolution", self.resolution, "m")
         check_heights(self.heights)
+        check_bounds(self.bounds)
         check_workers(self.workers)
         check_positive("--memory", self.memory_gb, "GB")
 
@@ -473,7 +477,7 @@ def check_output(
     held = held_files(out, files)
     is_compared = may_be_same and ((out / "tiles" / "manifest.json").exists() or (out / FINISHED).exists())
     if held and not overwrite and not is_compared:
-        raise OutputError(f"{out} holds another {what} ({', '.join(held)}). Choose another folder, or add --overwrite.")
+        raise OutputError(f"{out} holds another {what} ({', '.join(held)}). {OTHER_FOLDER}")
     parent = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     try:
         # Only an attempt tells for sure: permission bits say nothing of read-only disks.

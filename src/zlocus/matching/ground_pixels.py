@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import ConfigError
-from zlocus.core.footprints import ground_sample_distance
+from zlocus.core.footprints import Bounds, ground_sample_distance
 from zlocus.core.scene import ColourSource, ImageSource, ImageWindow, Scene, View, masked_pixels
 from zlocus.sensors.correction import ReducedModel
 
@@ -134,6 +134,29 @@ def check_resolution(resolution: float, scene: Scene, z: float, given: str) -> N
             f"{given} {resolution:g} m is too fine: two images are compared in every cell, and only {name} has pixels "
             f"of {finest:.2g} m on the ground, the next has {common:.2g} m. Ask for "
             f"{rounded_up(MIN_MIXED_CELL_SHARE * common):g} m or more, or add another fine image."
+        )
+
+
+def check_cells_in_overlap(cell_m: float, window_cells: int, shared: Bounds, pixel_m: float, given: str) -> None:
+    """Refuse cells so large that the smallest window of them does not fit into the ground that two images share.
+
+    cell_m : side of the cells, m; window_cells : cells along a side of the smallest window that images are compared in;
+    shared : bounds of the shared ground, m; pixel_m : the images' ground pixel, m; given : where the resolution was
+    set, for the message.
+
+    Raises
+    ------
+    ConfigError
+        No window fits.
+    """
+    width_m, height_m = shared[2] - shared[0], shared[3] - shared[1]
+    largest = min(width_m, height_m) / window_cells
+    if cell_m > largest:
+        raise ConfigError(
+            f"{given} {cell_m:g} m is too coarse for these images: a height takes windows of {window_cells} x "
+            f"{window_cells} cells, which are {window_cells * cell_m:g} m wide, and two images share only "
+            f"{width_m:.3g} x {height_m:.3g} m of ground. Ask for less than {largest:.2g} m; the images' pixels are "
+            f"{pixel_m:.2g} m on the ground."
         )
 
 

@@ -184,10 +184,14 @@ def height_step(views: tuple[View, ...], z: float, cell_m: float, max_shift_px: 
         rates = _rates_against_nadir(views, z, cell_m)
     else:
         rates = _rates_against_first(views, z, cell_m)
-    if not max(rates, default=0.0) > MIN_PARALLAX_RATE_PX:
+    # Large cells make the disparities small, and not the angles between the images.
+    pixel_m = ground_sample_distance(views[0], z)
+    pixel_m = pixel_m if np.isfinite(pixel_m) else cell_m
+    base_to_height = max(rates, default=0.0) * max(cell_m, pixel_m)
+    if not base_to_height > MIN_PARALLAX_RATE_PX * pixel_m:
         raise GeometryError(
-            f"All images look along the same line (base-to-height below {max(rates, default=0.0) * cell_m:.1e}), so "
-            "they show no heights. Add an image from another direction."
+            f"All images look along the same line (base-to-height ratio {base_to_height:.2g}), so they show no "
+            "heights. Add an image from another direction."
         )
     return max_shift_px / max(rates)
 

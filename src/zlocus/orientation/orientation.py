@@ -208,7 +208,7 @@ def orient(
     tie_points = with_rough_ties(adjustment, sensors, rough, xyz, rough_inlier_px)
     views = view_orientations(scene.views, adjustment, sensors, line_shifts)
     heights = tie_points.xyz[supported(tie_points.xyz, tie_points.sigma_z_m), 2]
-    doubts = doubts_about(scene.views, [v.residuals_after.median for v in views], [v.shift_px for v in views], heights)
+    off = [v.residuals_after.median for v in views], [v.shift_px for v in views]
     return Orientation(
         views=views,
         pairs=pair_orientations(scene, sensors, adjustment, ties.z_range),
@@ -222,7 +222,7 @@ def orient(
         bundle_adjustment=cameras.bundle_adjustment,
         refined_ties=refined,
         excluded_images=excluded_images_of(scene, ties.observations, wrong, options),
-        doubts=(*contradictions, *doubts),
+        doubts=(*contradictions, *doubts_about(scene.views, *off, heights, options.model != "none")),
     )
 
 

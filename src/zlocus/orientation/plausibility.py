@@ -85,22 +85,18 @@ def doubts_about(
     residual_px: Sequence[float],
     shift_px: Sequence[tuple[float, float]],
     heights: FloatArray,
+    is_corrected: bool = True,
 ) -> list[Doubt]:
-    """Doubts about the corrected cameras.
+    """Doubts about the cameras.
 
     residual_px : (i,) median length of the residuals of each image's ties; shift_px : (i, 2), by which the images were
-    moved; heights : (n,) m, ellipsoidal, of the trusted tie points.
+    moved; heights : (n,) m, ellipsoidal, of the trusted tie points; is_corrected : whether a correction was asked for.
     """
     doubts = []
     for view, residual, shift in zip(views, residual_px, shift_px, strict=True):
         far = float(np.hypot(*shift))
         if residual > MAX_USUAL_RESIDUAL_PX:
-            doubts.append(
-                Doubt(
-                    f"{view.name}: its tie points still lie {residual:.2f} px off after the correction (median), more "
-                    "than cameras that are in order show. Try `zlocus orient`, or ask for better cameras."
-                )
-            )
+            doubts.append(Doubt(f"{view.name}: {_off(residual, is_corrected)}"))
         if far > MAX_USUAL_SHIFT_PX:
             doubts.append(
                 Doubt(
@@ -109,6 +105,19 @@ def doubts_about(
                 )
             )
     return doubts + _outside_range(views, heights)
+
+
+def _off(residual_px: float, is_corrected: bool) -> str:
+    """What a large median residual of an image's ties means."""
+    if is_corrected:
+        return (
+            f"its tie points still lie {residual_px:.2f} px off after the correction (median), more than cameras that "
+            "are in order show. Try `zlocus orient`, or ask for better cameras."
+        )
+    return (
+        f"its tie points lie {residual_px:.2f} px off with the camera as delivered (median), for no correction was "
+        "asked for. `zlocus orient` corrects cameras."
+    )
 
 
 def _outside_range(views: Sequence[View], heights: FloatArray) -> list[Doubt]:

@@ -13,6 +13,7 @@ from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupR
 from zlocus.io.run_record import Stopwatch
 from zlocus.pipeline.cloud import oriented_cloud
 from zlocus.pipeline.dsm import check_before_opening, prepare_surface
+from zlocus.pipeline.extent import Extent, above
 from zlocus.pipeline.open_run import OpenRun, open_cloud_run, open_run
 from zlocus.pipeline.orient import control_points, options_of_command, terrain_heights
 from zlocus.pipeline.run_plan import Plan, orientation_s
@@ -42,12 +43,17 @@ def plan_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DryR
     (rows, cols), names = setup.grid.geobox.shape.yx, [view.name for view in scene.views]
     grid, heights = grid_record(setup.grid, setup.scene.crs), heights_record(setup)
     low, high = heights["searched_m"]
+    extent = Extent.of(setup.grid, setup.scene.crs)
     lines = [
-        f"Surface: {rows} x {cols} cells of {scene.cell_size:g} m in {setup.scene.crs.name}, from {len(names)} of "
+        f"Surface: {rows} rows x {cols} columns of {scene.cell_size:g} m in {extent.crs_text}, from {len(names)} of "
         f"{len(setup.scene.views)} images.",
-        f"Heights: {low:.1f} to {high:.1f} m above the ellipsoid, in steps of {scene.height_step:.3g} m.",
+        f"Area: {extent}.",
+        f"Heights: {low:.1f} to {high:.1f} m {above(setup.scene.crs)}, in steps of {scene.height_step:.3g} m.",
     ]
-    values = {"grid": grid, "heights": heights, "images": names, **_plan_values(surface.plan, run)}
+    values = {
+        "grid": grid, "extent": extent.as_dict(), "heights": heights, "images": names, "area_seen": surface.seen_share,
+        **_plan_values(surface.plan, run),
+    }  # fmt: skip
     if surface.water_polygons is not None:
         values["water_polygons"] = n_water = len(surface.water_polygons.names)
         lines.append(

@@ -34,6 +34,7 @@ from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most, plan_tiles
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.tasks import Outcome
+from zlocus.pipeline.extent import seen_sentence, seen_share_of_run
 from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
@@ -66,12 +67,21 @@ class DsmResult:
     """Result of `run_dsm`.
 
     out : folder of the products; coverage : share of the cells seen by two images or more that have a height;
-    was_finished : whether an earlier run of the same command had made the surface already.
+    was_finished : whether an earlier run of the same command had made the surface already; seen_share : share of the
+    area asked for that two images see, None where it is not known.
     """
 
     out: Path
     coverage: float
     was_finished: bool = False
+    seen_share: float | None = None
+
+    @property
+    def sentence(self) -> str:
+        """How complete the surface is."""
+        state = "already finished, " if self.was_finished else ""
+        text = f"{self.out}: {state}{100 * self.coverage:.1f} % of the cells seen by two images or more have a height."
+        return " ".join(part for part in (text, seen_sentence(self.seen_share)) if part)
 
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
@@ -148,6 +158,7 @@ class PreparedSurface:
     """A surface whose tiles can be matched: everything that they and the products need.
 
     inputs : files, with their states when the run began; tile_job : makes the tiles; digest : SHA-256 of the run setup;
+    seen_share : about the share of the area asked for that two images see, None where none was asked for;
     water_polygons : of water surfaces on the grid, None where none are given.
     """
 
@@ -160,7 +171,12 @@ class PreparedSurface:
     plan: Plan
     tile_job: TileJob
     digest: str
+    seen_share: float | None
     water_polygons: WaterPolygons | None = None
+
+    def seen_of(self, tally: Tally) -> float | None:
+        """Share of the area asked for that two images see, by the cells; None where no area was asked for."""
+        return None if self.seen_share is None else tally.seen_share
 
     @property
     def before(self) -> dict[str, NDArray[Any]]:
@@ -187,7 +203,7 @@ def prepare_surface(
         orientation = orient_views(
             opened_inputs.scene, config.orientation, progress, threads=request.workers, known_ties=ties
         )  # fmt: skip
-        note_orientation(orientation, progress)
+        note_orientation(orientation, progress, request.heights is not None)
     with stopwatch.stage("setup"):
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
@@ -196,8 +212,11 @@ def prepare_surface(
             None if run.water_polygons is None else water_on_grid(run.water_polygons, setup.grid.geobox, progress)
         )
     job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
+    share = seen_share_of_run(setup, run.polygons, bool(request.bounds or request.like))
+    if sentence := seen_sentence(share, "about "):
+        progress.note(sentence)
     return PreparedSurface(
-        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, water_polygons
+        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, share, water_polygons
     )  # fmt: skip
 
 
@@ -246,7 +265,10 @@ def write_products(
         write_report_inputs(request.out, setup, datum, config, stopwatch, progress)
         remove_outdated_curves(request.out, prepared_surface.inputs, progress)
     record = run_record(request, config, setup, datum, checksums, tally, prepared_surface.plan)
-    return record | {"setup_sha256": prepared_surface.digest, "stages": stopwatch.stages}
+    return record | {
+        "area_seen": prepared_surface.seen_of(tally), "setup_sha256": prepared_surface.digest,
+        "stages": stopwatch.stages,
+    }  # fmt: skip
 
 
 def finish(
@@ -263,7 +285,8 @@ def finish(
     shortcoming = shortcoming_of(tally, prepared_surface.setup.doubts, request.out, progress)
     write_finished(request.out, checkpoint.key, shortcoming)
     checkpoint.remove()
-    return _accepted(request, DsmResult(request.out, tally.coverage), shortcoming)
+    result = DsmResult(request.out, tally.coverage, seen_share=prepared_surface.seen_of(tally))
+    return _accepted(request, result, shortcoming)
 
 
 def _checked_plan(request: DsmRequest, config: RunConfig, run: OpenRun, setup: RunSetup, tiles: Sequence[Tile]) -> Plan:
@@ -284,8 +307,9 @@ def _already_finished(
     assert run.finished is not None, "callers make sure"
     make_missing(request, config, run.opened_inputs, run.finished, missing, progress)
     run.checkpoint.remove()  # where a run was stopped between its last file and its end
-    coverage = float(read_record(request.out / RECORD)["coverage"])
-    return _accepted(request, DsmResult(request.out, coverage, was_finished=True), run.finished.shortcoming)
+    record = read_record(request.out / RECORD)
+    result = DsmResult(request.out, float(record["coverage"]), True, record.get("area_seen"))
+    return _accepted(request, result, run.finished.shortcoming)
 
 
 def _accepted(request: DsmRequest, result: DsmResult, shortcoming: str) -> DsmResult:

@@ -10,7 +10,7 @@ from typing import Any
 from zlocus.core.errors import OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import FINISHED, CloudRequest, DsmRequest, SetupRequest, held_files
+from zlocus.core.requests import FINISHED, OTHER_FOLDER, CloudRequest, DsmRequest, SetupRequest, held_files
 from zlocus.io.run_record import read_record
 from zlocus.pipeline.execution.checkpoint import TileCheckpoint, difference
 from zlocus.pipeline.fingerprint import digest_of
@@ -67,19 +67,17 @@ def finished_run(request: DsmRequest | CloudRequest, checkpoint: TileCheckpoint)
     finished, held = read_finished(out), held_files(out)
     if finished is None:
         if held and not checkpoint.is_of_this_run:
-            raise OutputError(
-                f"{out} holds another run ({', '.join(held)}). Choose another folder, or add --overwrite."
-            )
+            raise OutputError(f"{out} holds another run ({', '.join(held)}). {OTHER_FOLDER}")
         return None
     differs = difference(finished.key, comparable(checkpoint.key)) if finished.key else f"its {FINISHED} is damaged"
     if differs:
         if checkpoint.is_of_this_run:
             return None
-        raise OutputError(f"{out} holds another run: {differs}. Choose another folder, or add --overwrite.")
+        raise OutputError(f"{out} holds another run: {differs}. {OTHER_FOLDER}")
     if not request.resume:
         raise OutputError(
             f"{out} holds this run, already finished, which --no-resume asks not to take. Leave --no-resume out, or "
-            "add --overwrite to make it anew."
+            "add --overwrite (in Python: overwrite=True) to make it anew."
         )
     return finished
 
@@ -124,7 +122,7 @@ def files_gone(out: Path, finished: Finished, progress: Progress) -> set[str]:
         it, is_not = ("them", "are not") if len(other) > 1 else ("it", "is not")
         raise OutputError(
             f"{out} holds this run, already finished, but {', '.join(other)} {is_not} what the run wrote. Remove {it} "
-            f"to have {it} made again, or add --overwrite to make the whole run anew."
+            f"to have {it} made again, or add --overwrite (in Python: overwrite=True) to make the whole run anew."
         )
     return gone
 
@@ -193,7 +191,8 @@ def _make_of_ties(
     if digest_of(setup.match_scene, orientation) != record.get("setup_sha256"):
         raise OutputError(
             f"{', '.join(names)} of {out} cannot be made again, for cameras and heights came out otherwise than in the "
-            "run, as they may on another machine. Add --overwrite to make the whole run anew."
+            "run, as they may on another machine. Add --overwrite (in Python: overwrite=True) to make the whole run "
+            "anew."
         )
     if TIES in names:
         write_ties(out / TIES, orientation, setup.scene, opened_inputs.vertical_datum)

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from zlocus.core.errors import ConfigError, GeometryError
+from zlocus.core.errors import ConfigError, CoverageError, GeometryError
 from zlocus.core.footprints import (
     AREA_MARGIN,
     Bounds,
@@ -46,7 +46,7 @@ from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.pipeline.height_range import possible_heights, range_from_ties
-from zlocus.pipeline.setup import RunSetup, orient_views, reference_features, supported_views
+from zlocus.pipeline.setup import RunSetup, orient_views, reference_features, supported_views, wrong_heights
 from zlocus.sensors.frame import FrameModel
 
 # Margin around a window of pixels that may show an area.
@@ -225,7 +225,11 @@ def set_up_images(
         orientation = orient_views(scene, options, progress, known_ties=known_ties)
         is_supported = supported(orientation.xyz, orientation.sigma_z_m)
         z_range = scene.heights or range_from_ties(scene, orientation, options).expected
-        used = supported_views(orientation.apply(scene), orientation)
+        try:
+            used = supported_views(orientation.apply(scene), orientation)
+        except CoverageError as error:
+            wrong = None if scene.heights is None else wrong_heights(scene.heights, scene, config)
+            raise wrong or error from error
         return ImageSetup(used, orientation, orientation.xyz, is_supported, z_range)
     space = image_space(scene, scene.views[0].name, (0.0, 0.0))
     given = None if scene.heights is None else hypotheses_of_heights(space, scene.heights)

@@ -38,7 +38,7 @@ def run_curves(request: CurvesRequest, config: RunConfig, progress: Progress) ->
         opened_inputs = open_inputs(setup_request, progress)
         check_views(request, opened_inputs.scene)
     orientation = orient_views(opened_inputs.scene, config.orientation, progress)
-    note_orientation(orientation, progress)
+    note_orientation(orientation, progress, request.heights is not None)
     setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     place = requested_place(request, supported_views(setup.scene, orientation), setup.match_scene, ties)

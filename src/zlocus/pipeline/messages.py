@@ -13,6 +13,8 @@ from zlocus.orientation.plausibility import Doubt
 
 # A message names at most this many images or doubts.
 MAX_NAMED = 12
+# A height takes at least this many images.
+MIN_VIEWS = 2
 
 
 def some_names(names: Sequence[str]) -> str:
@@ -30,17 +32,28 @@ def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> 
         )
 
 
-def note_orientation(orientation: Orientation, progress: Progress) -> None:
+def note_orientation(orientation: Orientation, progress: Progress, has_heights: bool = False) -> None:
     """Say which corrections were applied, which parameters of the cameras were calibrated or held, which images take no
-    part, and which cameras are doubtful."""
+    part, and which cameras are doubtful.
+
+    has_heights : whether heights were asked for, and images are matched next. Where fewer than two then have ties, the
+    heights may be the reason, and nothing is said here: see `setup.set_up_run`.
+    """
+    if has_heights and len(orientation.views) - len(orientation.excluded_images) < MIN_VIEWS:
+        return
     progress.note(what_was_applied(orientation))
     for sentence in self_calibration_sentences(orientation):
         progress.note(sentence)
+    note_excluded(orientation, progress)
+    note_doubts(orientation.doubts, progress)
+
+
+def note_excluded(orientation: Orientation, progress: Progress) -> None:
+    """Say which images take no part in the matching, and why."""
     for excluded in orientation.excluded_images[:MAX_NAMED]:
         progress.note(str(excluded))
     if len(orientation.excluded_images) > MAX_NAMED:
         progress.note(f"{len(orientation.excluded_images) - MAX_NAMED} more images take no part: see run.json.")
-    note_doubts(orientation.doubts, progress)
 
 
 def self_calibration_sentences(orientation: Orientation) -> list[str]:
@@ -90,8 +103,10 @@ def what_was_applied(orientation: Orientation) -> str:
             f"Cameras left as delivered: {len(orientation.refined_xyz)} tie points show no errors beyond their noise, "
             f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px."
         )
+    if orientation.model == "none":
+        return "Cameras used as delivered: no correction was asked for."
     if not moved:
-        return "Pointing: no correction applied."
+        return "Pointing not corrected: tie points show no errors, or there are none."
     if len(moved) <= MAX_NAMED:
         named = ", ".join(f"{v.name} ({v.shift_px[0]:+.2f}, {v.shift_px[1]:+.2f})" for v in moved)
         by = f"px (column, row): {named}."
@@ -103,4 +118,6 @@ def what_was_applied(orientation: Orientation) -> str:
             f"Cameras corrected by a bundle adjustment of {len(orientation.refined_xyz)} tie points, to "
             f"{orientation.bundle_adjustment.solution.sigma0_px:.2f} px; their images moved by, {by}"
         )
-    return f"Pointing corrected from {len(orientation.xyz)} tie points, {by}"
+    n_rough = len(orientation.xyz) - orientation.n_refined
+    rough = f" ({n_rough} more, less exact ones, tell heights only)" if n_rough else ""
+    return f"Pointing corrected from {orientation.n_refined} tie points{rough}, {by}"

@@ -40,7 +40,7 @@ def run_paper(request: PaperRequest, config: RunConfig, progress: Progress) -> s
             opened_inputs = open_inputs(setup_request, progress)
             check_reference(request, [view.name for view in opened_inputs.scene.views])
         orientation = orient_views(opened_inputs.scene, config.orientation, progress)
-        note_orientation(orientation, progress)
+        note_orientation(orientation, progress, request.heights is not None)
         setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
         with progress.stage("Match curves"):
             space = paper_space(setup, request, config)

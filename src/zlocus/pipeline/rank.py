@@ -49,7 +49,7 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
     with watch.stage("orient"):
         orientation = orient_views(opened_inputs.scene, config.orientation, progress)
         check_ties(orientation, opened_inputs.scene)
-        note_orientation(orientation, progress)
+        note_orientation(orientation, progress, request.heights is not None)
     with watch.stage("rank"):
         setup = set_up_run(setup_request, opened_inputs, orientation, config, progress)
         labelled_ties = rank_tiles(setup, request.workers, config, progress)

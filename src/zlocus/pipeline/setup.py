@@ -49,7 +49,13 @@ from zlocus.io.input_files import files_of
 from zlocus.io.scene_file import open_scene
 from zlocus.io.vertical import VerticalDatum, named_vertical_datum
 from zlocus.io.water_polygons import files_of_water
-from zlocus.matching.ground_pixels import cell_side, check_resolution, ground_pixels, median_ground_pixel
+from zlocus.matching.ground_pixels import (
+    cell_side,
+    check_cells_in_overlap,
+    check_resolution,
+    ground_pixels,
+    median_ground_pixel,
+)
 from zlocus.matching.match_scene import MatchScene, build_match_scene, height_step
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation, OrientationRequest, orient
@@ -58,11 +64,9 @@ from zlocus.orientation.tie_heights import supported
 from zlocus.orientation.tie_refinement import RefinedTies
 from zlocus.orientation.ties import Ties, find_ties
 from zlocus.pipeline.height_range import height_range_of_run, heights_below_cameras, possible_heights, with_heights
-from zlocus.pipeline.messages import note_dem, note_doubts, some_names
+from zlocus.pipeline.messages import MIN_VIEWS, note_dem, note_doubts, note_excluded, some_names
 from zlocus.pipeline.request_fit import check_bounds_in_metres, check_heights_of_cameras
 
-# A height takes at least this many images.
-MIN_VIEWS = 2
 # Fewer tie points than this do not cast doubt on a terrain model.
 MIN_TIES_TO_COMPARE = 20
 # Progress of the stage "Tie points": where each step begins, and its share of the time.
@@ -256,9 +260,15 @@ def set_up_run(
     try:
         scene = supported_views(corrected, orientation)
     except CoverageError as error:
-        raise _wrong_heights(request, opened_inputs.scene, config) or error from error
+        if request.heights is None:
+            raise
+        if wrong := wrong_heights(request.heights, opened_inputs.scene, config):
+            raise wrong from error
+        note_excluded(orientation, progress)
+        raise
     height_range = height_range_of_run(request, scene, orientation, config, progress)
     grid = grid_of_run(request, opened_inputs.like, scene, orientation, height_range)
+    check_cells(request, scene, height_range, grid, config)
     match_scene = match_scene_of_run(request, scene, orientation, height_range, grid, config)
     far = doubts_from_dem(request, scene, orientation, config)
     note_doubts(far, progress)
@@ -292,10 +302,8 @@ def supported_views(scene: Scene, orientation: Orientation) -> Scene:
     )
 
 
-def _wrong_heights(request: SetupRequest, scene: Scene, config: RunConfig) -> GeometryError | None:
+def wrong_heights(heights: tuple[float, float], scene: Scene, config: RunConfig) -> GeometryError | None:
     """The error of requested heights that do not contain the ground, where tie points are found without them."""
-    if request.heights is None:
-        return None
     try:
         orientation = orient_views(replace(scene, heights=None), config.orientation, SilentProgress())
     except ZlocusError:
@@ -305,7 +313,7 @@ def _wrong_heights(request: SetupRequest, scene: Scene, config: RunConfig) -> Ge
         return None
     low, high = np.percentile(z, (1, 99))
     return GeometryError(
-        f"No tie point has one of the heights asked for, {request.heights[0]:.6g} to {request.heights[1]:.6g} m: those "
+        f"No tie point has one of the heights asked for, {heights[0]:.6g} to {heights[1]:.6g} m: those "
         f"of these images lie between {low:.0f} and {high:.0f} m above the ellipsoid. Give --heights that contain the "
         "ground, or leave it out."
     )
@@ -369,6 +377,24 @@ def grid_of_run(
     ties = orientation.xyz[supported(orientation.xyz, orientation.sigma_z_m)]
     bounds = request.bounds or area_to_match(scene, height_range.expected, ties)
     return grid_from_bounds(bounds, cell_m, scene.crs)
+
+
+def check_cells(request: SetupRequest, scene: Scene, height_range: HeightRange, grid: Grid, config: RunConfig) -> None:
+    """Refuse a grid whose cells are too large for the ground that two images share.
+
+    Raises
+    ------
+    ConfigError
+        See `check_cells_in_overlap`.
+    GeometryError
+        No two images share any.
+    """
+    if request.method.startswith("gc3"):  # which compares pixels
+        return
+    given = "--resolution" if request.like is None else f"--like {request.like}: its cell of"
+    shared = shared_ground(scene, height_range.searched)
+    pixel_m = median_ground_pixel(scene, height_range.middle)
+    check_cells_in_overlap(grid.cell_m, config.cost.small_window, shared, pixel_m, given)
 
 
 def match_scene_of_run(

@@ -48,6 +48,7 @@ class Tally:
     labelled_ties : labels of tie points, tile by tile; water_found : water surfaces, once all tiles are written.
     """
 
+    n_asked: int = 0
     n_seen: int = 0
     n_matched: int = 0
     n_left_out: int = 0
@@ -61,6 +62,7 @@ class Tally:
         """Add the counts of a tile."""
         quality = tile_product.surface.quality
         asked = (quality & np.uint16(Quality.OUTSIDE)) == 0
+        self.n_asked += int(asked.sum())
         self.n_seen += int((asked & ((quality & np.uint16(Quality.UNSEEN)) == 0)).sum())
         is_matched = np.isfinite(tile_product.surface.height) & ((quality & np.uint16(Quality.FILLED)) == 0)
         self.n_matched += int(is_matched.sum())
@@ -82,6 +84,11 @@ class Tally:
     def coverage(self) -> float:
         """Share of the cells seen by two images or more, without levelled water, whose height was matched."""
         return self.n_matched / self.n_seen if self.n_seen else 0.0
+
+    @property
+    def seen_share(self) -> float:
+        """Share of the requested cells that two images or more see."""
+        return round(self.n_seen / self.n_asked, 6) if self.n_asked else 1.0
 
     def as_dict(self) -> dict[str, Any]:
         """The counts as run.json holds them."""

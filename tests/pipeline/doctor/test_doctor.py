@@ -159,7 +159,7 @@ def test_the_plan_is_what_a_run_does(good, tmp_path):
     assert began["event"] == "began"
     assert plan["seconds"] == pytest.approx(began["seconds"], rel=1e-3)
     assert plan["n_tiles"] == began["n_tiles"]
-    assert f"{plan['shape'][0]} x {plan['shape'][1]} cells" in text
+    assert f"{plan['shape'][0]} rows x {plan['shape'][1]} columns" in text
     assert "rough estimate" in text
 
 
@@ -598,7 +598,7 @@ def test_what_takes_no_part_and_what_is_doubtful_is_told():
 
 @pytest.mark.parametrize(("machine", "level"), [(None, []), (9 * 10**9, []), (7 * 10**9, ["poor"])])
 def test_more_memory_than_the_machine_has(machine, level):
-    plan = RunPlan(0.5, (9, 9), (0.0, 1.0), 0.1, 10, 8, 2 * 10**9, 4, machine, 1.0, 1.0)
+    plan = RunPlan(0.5, (9, 9), (0.0, 1.0), 0.1, 10, 8, 2 * 10**9, 4, machine, 1.0, 1.0, None)
     assert [finding.level for finding in plan_findings(plan, None)] == level
 
 
@@ -617,3 +617,21 @@ def test_suns_that_are_far_apart_are_told(good, tmp_path):
     assert (aft["sun_azimuth_deg"], aft["sun_altitude_deg"]) == (230.0, 30.0)
     _, _, report = doctor(tmp_path / "out", paths["nadir"], paths["fore"])
     assert not sentences(report, "note")
+
+
+def test_the_plan_names_where_the_surface_lies_and_follows_the_bounds(good, healthy, tmp_path):
+    (_, told, report), _ = healthy
+    plan = report["plan"]
+    xmin, ymin, xmax, ymax = plan["extent"]["bounds"]
+    assert "- covers, in EPSG:" in told
+    assert "m above the ellipsoid, " in told
+    half = (xmin, ymin, (xmin + xmax) / 2, ymax)
+    status, text, report = doctor(tmp_path / "out", *good.values(), "--bounds", *half)
+    assert status == 0, text
+    assert report["plan"]["shape"][1] == pytest.approx(plan["shape"][1] / 2, abs=2)
+    beyond = (xmin - 3 * (xmax - xmin), ymin, xmax, ymax)
+    told = sentences(doctor(tmp_path / "beyond", *good.values(), "--bounds", *beyond)[2], "poor")
+    assert any("of the area asked for" in each for each in told)
+    far = doctor(tmp_path / "far", *good.values(), "--bounds", xmin - 9000, ymin, xmax - 9000, ymax)
+    assert far[0] == 2
+    assert any("lies outside the ground that two images see" in each for each in sentences(far[2], "stops"))

@@ -106,12 +106,12 @@ def test_what_was_found_before_is_whole_or_not_there(tmp_path, damage):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"request": {"crs": "EPSG:32631"}}, 'request.crs was null there and is "EPSG:32631" now'),
-        ({"options": {"a": {"b": 2}}}, "options.a.b was 1 there and is 2 now"),
+        ({"request": {"crs": "EPSG:32631"}}, "--crs was not given there and is EPSG:32631 now"),
+        ({"options": {"a": {"b": 2}}}, "the option a.b was 1 there and is 2 now"),
         ({"inputs": {"i.tif": [5, 7]}}, "i.tif has changed since"),
         ({"inputs": {"i.tif": [5, 6], "j.tif": [1, 1]}}, "j.tif is new"),
         ({"inputs": {}}, "i.tif is missing"),
-        ({"versions": {"zlocus": "2"}}, 'versions.zlocus was "1" there and is "2" now'),
+        ({"versions": {"zlocus": "2"}}, "the version of zlocus was 1 there and is 2 now"),
     ],
 )
 def test_tiles_of_another_run_are_refused(tmp_path, change, says):
@@ -225,7 +225,7 @@ def test_no_tile_holds_objects(tmp_path):
 
 def test_differences_by_hand():
     assert difference({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 2}}) == ""
-    assert difference({"b": {"c": 2}}, {"b": {"c": 2, "d": 3}}) == "b.d was null there and is 3 now"
+    assert difference({"b": {"c": 2}}, {"b": {"c": 2, "d": 3}}) == "b.d was not given there and is 3 now"
     assert "..." in difference({"a": "x" * 100}, {"a": ""})
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zlocus.core.footprints import PairGeometry, ViewGeometry
+from zlocus.core.quoting import counted
 from zlocus.core.scene import View
 from zlocus.io.scene_file import RefusedView
 from zlocus.orientation.parameter_groups import kind_of
@@ -16,6 +17,7 @@ from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, VERDICTS, Finding
 from zlocus.pipeline.doctor.plan import ROUGHLY, RunPlan
 from zlocus.pipeline.doctor.quality import ImageQuality, percent
 from zlocus.pipeline.doctor.ties import QuickTies
+from zlocus.pipeline.extent import above
 from zlocus.products.acquisitions import COLUMNS, acquisition_record, acquisition_records, acquisition_rows
 
 MOST_PAIRS = 30
@@ -200,12 +202,15 @@ def _plan_lines(diagnosis: Diagnosis) -> Iterator[str]:
     rows, cols = plan.shape
     memory = f"{plan.tile_bytes * plan.workers / 1e9:.2f} GB"
     machine = "" if plan.machine_bytes is None else f"; this machine has {plan.machine_bytes / 1e9:.1f} GB"
-    which = "A full run of the images that can be used" if diagnosis.refused else "A full run"
+    which = "A run of the images that can be used" if diagnosis.refused else "A run"
     yield "\n".join(
         [
             which,
-            f"- searches heights from {low:.1f} to {high:.1f} m, {plan.n_steps} steps of {plan.step_m:.2g} m;",
-            f"- makes {rows} x {cols} cells of {plan.cell_m:g} m in {plan.n_tiles} tiles, {plan.workers} at a time;",
+            f"- searches heights from {low:.1f} to {high:.1f} m {above(plan.extent.crs)}, {plan.n_steps} steps of "
+            f"{plan.step_m:.2g} m;",
+            f"- makes {rows} rows x {cols} columns of {plan.cell_m:g} m in {counted(plan.n_tiles, 'tile')}, "
+            f"{plan.workers} at a time;",
+            f"- covers, in {plan.extent.crs_text}, {plan.extent};",
             f"- needs about {memory} for its tiles{machine};",
             f"- matches for about {duration(plan.seconds)}. This is a rough estimate, {plan.view_cells / 1e6:.2g} "
             f"million cells times images at the rate of the benchmarks; it may be {ROUGHLY:g} times as long or short.",
@@ -215,7 +220,13 @@ def _plan_lines(diagnosis: Diagnosis) -> Iterator[str]:
 
 def _plan_record(plan: RunPlan) -> dict[str, Any]:
     record = {name: _rounded(value) if isinstance(value, float) else value for name, value in vars(plan).items()}
-    return record | {"shape": list(plan.shape), "heights": [_rounded(z) for z in plan.heights], "rough_factor": ROUGHLY}
+    extent = {"crs": plan.extent.crs.to_string(), **plan.extent.as_dict()}
+    return record | {
+        "extent": extent,
+        "shape": list(plan.shape),
+        "heights": [_rounded(z) for z in plan.heights],
+        "rough_factor": ROUGHLY,
+    }
 
 
 def _table(heading: str, rows: Iterable[Sequence[str]]) -> str:

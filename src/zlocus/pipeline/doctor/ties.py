@@ -15,7 +15,8 @@ from zlocus.core.scene import Scene, held_window
 from zlocus.orientation.orientation import Orientation
 from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding, poor
 from zlocus.pipeline.height_range import range_below_cameras, range_from_ties
-from zlocus.pipeline.setup import MIN_VIEWS, orient_views
+from zlocus.pipeline.messages import MIN_VIEWS
+from zlocus.pipeline.setup import orient_views
 
 QUICK_FEATURES = 4000
 # Images above this size are reduced twice as much as in a run.

@@ -29,6 +29,8 @@ LISTS = "done*.jsonl"
 # Arrays that were computed before the first tile: the tie points.
 BEFORE = "before.npz"
 SCHEMA = 3
+# Options whose names differ from those of the fields of a request.
+OPTION_NAMES = {"references": "reference"}
 
 
 @dataclass
@@ -89,7 +91,7 @@ class TileCheckpoint:
         if differs and listed:
             raise OutputError(
                 f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give the same "
-                "options as that run, or add --overwrite to start anew."
+                "options as that run, or add --overwrite (in Python: overwrite=True) to start anew."
             )
         if not differs:
             store.finished, store.before = listed, str(manifest.get("before", ""))
@@ -165,7 +167,8 @@ class TileCheckpoint:
             if self.finished and manifest.get("setup") != setup_digest:
                 raise OutputError(
                     f"{self.folder} holds {len(self.finished)} finished tiles for other cameras and heights, as they "
-                    "may be found on another machine. Add --overwrite to start anew, or resume on the first machine."
+                    "may be found on another machine. Add --overwrite (in Python: overwrite=True) to start "
+                    "anew, or resume on the first machine."
                 )
         if not self.finished or self.arrays_before_tiles() is None:
             with _written(self.folder):
@@ -269,12 +272,24 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = 
             return difference(one, other, f"{prefix}{name}.")
         if prefix == "inputs.":
             return f"{name} has changed since" if one and other else f"{name} is {'new' if other else 'missing'}"
-        return f"{prefix}{name} was {_shown(one)} there and is {_shown(other)} now"
+        return f"{_named(prefix, name)} was {_shown(one)} there and is {_shown(other)} now"
     return ""
 
 
+def _named(prefix: str, name: str) -> str:
+    """What an entry of a key is called by the user: the option of the command line where there is one."""
+    group, _, rest = f"{prefix}{name}".partition(".")
+    if group == "request":
+        return f"--{OPTION_NAMES.get(rest, rest).replace('_', '-')}"
+    if group == "options":
+        return f"the option {rest}"
+    return f"the version of {rest}" if group == "versions" else f"{prefix}{name}"
+
+
 def _shown(value: Any) -> str:
-    text = json.dumps(value)
+    if value is None or value == []:
+        return "not given"
+    text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
