@@ -40,7 +40,9 @@ def pipeline(monkeypatch):
         config: RunConfig
 
         def behave(self) -> Any:
-            return SimpleNamespace(out=Path("OUT"), coverage=0.987, was_finished=False)
+            return SimpleNamespace(
+                sentence="OUT: 98.7 % of the cells have a height.", as_dict=lambda: {"coverage": 0.987}
+            )
 
         def run_dsm(self, request, config, progress):
             self.request, self.config = request, config

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -16,8 +18,10 @@ from zlocus.cli.answer import Answer
 from zlocus.cli.app import COMMANDS, app
 from zlocus.cli.commands import command_of
 from zlocus.cli.config import ConfigOptions
+from zlocus.cli.console import Console, OutputOptions
 from zlocus.cli.exit_status import show_our_warnings
 from zlocus.core.errors import CoverageError, ZlocusWarning
+from zlocus.core.signals import Ended
 from zlocus.io.run_record import Stopwatch
 
 # A line of a log: time with its zone, and what was said.
@@ -35,7 +39,7 @@ def said(tmp_path):
     """Run a command that says a bit of everything: its exit status, standard output and standard error."""
     import typer
 
-    def run(*arguments: object, answer: Answer | None = None, error: Exception | None = None):
+    def run(*arguments: object, answer: Answer | None = None, error: BaseException | None = None):
         def speak(options, console):
             """Speak."""
             with Stopwatch().stage("work"), console.progress.stage("Working"):
@@ -80,6 +84,25 @@ def test_verbose_adds_versions_details_and_traces(said):
     assert result.stderr.count("Half of it is done.") == 1
     assert "Traceback" in said("-v", error=CoverageError("too little.")).stderr
     assert "Traceback" not in said(error=CoverageError("too little.")).stderr
+
+
+def test_a_signal_has_no_trace(said):
+    result = said("-v", error=Ended(signal.SIGTERM))
+    assert result.exit_code == 143
+    assert "Traceback" not in result.stderr
+
+
+def test_json_keeps_notes_and_warnings_of_commands_that_give_them(said):
+    kept = []
+    console = Console("speak", OutputOptions(as_json=True))
+    try:
+        console.progress.note("Half of it is done.")
+        logging.getLogger("zlocus").warning("zlocus: %s", "mind this.")
+        kept = list(console.notes)
+    finally:
+        console.close()
+    logging.getLogger("zlocus").warning("zlocus: %s", "too late.")
+    assert kept == console.notes == ["Half of it is done.", "mind this."]
 
 
 def test_quiet_and_verbose_exclude_each_other(said):

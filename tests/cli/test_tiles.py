@@ -53,7 +53,7 @@ def test_options_reach_the_pipeline(zl, monkeypatch, tmp_path):
 def test_what_a_task_says(zl, monkeypatch):
     monkeypatch.setattr("zlocus.pipeline.array_jobs.run_task", lambda out, number, *_: TaskResult(number, 4, 3))
     done = zl("tiles", "run", "out", 5)
-    assert done.stdout == "out: task 5 is finished, 3 of its 4 tiles made. 1 were there already.\n"
+    assert done.stdout == "out: task 5 is finished, 3 of its 4 tiles made. 1 was there already.\n"
     assert zl("tiles", "run", "out", "five").exit_code == 2
 
 

@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import rasterio
 from typer.testing import CliRunner
 
 import zlocus.pipeline.array_jobs
@@ -134,7 +135,7 @@ def test_report_products_and_inspector_take_the_assembled_surface(zl, out):
 
 def test_a_plan_says_what_there_is_and_what_is_left(zl, out):
     said = zl("tiles", "plan", out).stdout
-    assert "4 tiles in 3 tasks, numbered from 1 to 3, each of at most 2" in said
+    assert "4 tiles in 3 tasks, numbered from 1 to 3, each of at most 2 tiles. A task needs" in said
     assert "GB of memory" in said
     assert "Done: 0 of 3 tasks, 0 of 4 tiles." in said
     assert "Left: tasks 1-3." in said
@@ -157,7 +158,9 @@ def test_the_number_of_tasks_is_that_of_the_tiles_by_default(zl, images, tmp_pat
     out = tmp_path / "more"
     words[words.index(str(tmp_path / "out"))] = str(out)
     more = zl(*words, "--tasks", 9)
-    assert "4 tiles in 9 tasks, numbered from 1 to 9, each of at most 1" in more.stdout
+    assert (
+        "4 tiles in 9 tasks, numbered from 1 to 9, each of at most 1 tile; only tasks 3,5,7,9 have any." in more.stdout
+    )
     left = stored_plan(out).left(())
     assert len(left) == 4
     for number in range(1, 10):
@@ -178,7 +181,7 @@ def test_the_same_plan_again_changes_nothing(zl, images, out, tmp_path):
     other = asked(images, out, tmp_path, "--tasks", "2")
     assert "is planned in 3 tasks already" in sentence_of(zl(*other), 2)
     another = asked(images, out, tmp_path, "--fill", "interpolate")
-    assert "finished tiles of another run" in sentence_of(zl(*another), 2)
+    assert "holds 1 finished tile of another run: --fill was none there" in sentence_of(zl(*another), 2)
     anew = zl(*asked(images, out, tmp_path, "--fill", "interpolate", "--overwrite"))
     assert "Done: 0 of 3 tasks" in anew.stdout
 
@@ -224,7 +227,7 @@ def test_a_damaged_tile_is_made_again(zl, straight, out):
     (out / FOLDER / f"{name}.npz").write_bytes(b"PK nothing")
     assert "(1)" in sentence_of(zl("tiles", "assemble", out), 3)
     assert not (out / "dsm.tif").exists()
-    assert "1 of its 1 tiles made" in zl("tiles", "run", out, 1).stdout
+    assert "1 of its 1 tile made" in zl("tiles", "run", out, 1).stdout
     assert zl("tiles", "assemble", out).exit_code == 0
     check_same_files(out, straight)
 
@@ -353,7 +356,7 @@ def test_a_tile_that_fails_costs_no_other(zl, straight, out, monkeypatch):
     assert "IndexError: index 7 is out of bounds" in said
     assert "give the same command again" in said
     monkeypatch.undo()
-    assert "1 of its 2 tiles made. 1 were there already." in zl("tiles", "run", out, 3).stdout
+    assert "1 of its 2 tiles made. 1 was there already." in zl("tiles", "run", out, 3).stdout
     assert [zl("tiles", "run", out, number).exit_code for number in (1, 2)] == [0, 0]
     assert zl("tiles", "assemble", out).exit_code == 0
     check_same_files(out, straight)
@@ -464,7 +467,9 @@ def test_a_run_keeps_out_while_a_task_works(zl, images, out, tmp_path):
     plan = stored_plan(out)
     dsm = command(images("sine"), out, tmp_path)
     with plan.checkpoint().joined("1"):
-        assert "Another run writes to" in sentence_of(zl(*dsm[dsm.index("dsm") :]), 2)
+        refused = zl(*dsm[dsm.index("dsm") :])
+        assert "Another run writes to" in sentence_of(refused, 2)
+        assert len(refused.stderr.splitlines()) == 1  # before images are opened
         assert zl("tiles", "run", out, 2).exit_code == 0
     with plan.checkpoint().open(plan.digest):
         assert "needs" in sentence_of(zl("tiles", "run", out, 1), 2)
@@ -506,3 +511,28 @@ def test_the_time_of_tasks_is_that_while_any_of_them_worked():
     stage = matching_of_tasks([*tiles, {"event": "began", "time": ends[0]}])
     assert stage == {"name": "match", "wall_s": 12.5, "cpu_s": 9.0, "peak_mb": 110.0}
     assert matching_of_tasks([])["wall_s"] == 0.0
+
+
+def test_one_run_says_that_it_takes_a_plan_over(zl, images, out, tmp_path):
+    dsm = command(images("sine"), out, tmp_path)
+    done = zl(*dsm[dsm.index("dsm") :], "--json")
+    assert done.exit_code == 0, done.output
+    record = json.loads(done.stdout)
+    (note,) = (sentence for sentence in record["notes"] if "plan of tasks" in sentence)
+    assert note.endswith("This run makes it at once, with the tiles that are finished, and removes the plan.")
+    assert not (out / FOLDER).exists()
+    # The object names everything that was written, and where it lies.
+    assert {Path(file).name for file in record["files"]} >= {"dsm.tif", "run.json", "finished.json", "ties.gpkg"}
+    assert all(Path(file).is_file() for file in record["files"])
+    assert Path(record["run_record"]) == out / "run.json"
+    with rasterio.open(out / "dsm.tif") as source:
+        assert record["grid"]["bounds"] == pytest.approx(tuple(source.bounds))
+        assert record["grid"]["shape"] == list(source.shape)
+    assert record["wall_s"] > 0
+
+
+def test_a_plan_with_more_tasks_than_tiles_counts_those_with_tiles(zl, images, tmp_path):
+    words = asked(images, tmp_path / "out", tmp_path)
+    words[words.index("3")] = "9"
+    record = json.loads(zl(*words, "--json").stdout)
+    assert (record["tasks"], record["tasks_with_tiles"], len(record["left"])) == (9, 4, 4)

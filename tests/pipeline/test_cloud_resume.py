@@ -109,7 +109,7 @@ def interrupted(images, out, monkeypatch):
 
 def test_a_resumed_run_has_the_same_settings(images, tmp_path, monkeypatch):
     out = interrupted(images, tmp_path / "out", monkeypatch)
-    with pytest.raises(OutputError, match=r"holds 5 finished tiles of another run: request\.bounds was null there"):
+    with pytest.raises(OutputError, match=r"holds 5 finished tiles of another run: --bounds was not given there"):
         made(images, out, bounds=PART)
     other = replace(CONFIG, pyramid=replace(CONFIG.pyramid, halo=8))
     with pytest.raises(OutputError, match=r"options\.pyramid\.halo was"):

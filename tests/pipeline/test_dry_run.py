@@ -50,7 +50,7 @@ def test_the_plans_of_a_cloud_and_an_orientation_write_nothing(pair, tmp_path):
     cloud = plan_cloud(CloudRequest(pair, tmp_path / "cloud", references=("img_n1",)), CONFIG, SilentProgress())
     assert cloud.values["images"] == ["img_n1"]
     assert cloud.values["plan"]["tiles"] >= 1
-    assert "Cloud: the pixels of 1 images (img_n1)." in cloud.text
+    assert "Cloud: the pixels of 1 image (img_n1)." in cloud.text
     oriented = plan_orient(OrientRequest(pair, tmp_path / "oriented"), CONFIG, SilentProgress())
     assert oriented.values["model"] == "joint"
     assert oriented.values["control_points"] == 0

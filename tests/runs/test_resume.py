@@ -367,7 +367,7 @@ def test_what_was_changed_meanwhile_is_said(images, tmp_path, monkeypatch):
         run(copied, tmp_path / "out", SMALL_TILES, report=False)
     monkeypatch.undo()
     n = n_finished(tmp_path / "out")
-    with pytest.raises(OutputError, match=r"holds 3 finished tiles of another run: request\.heights was"):
+    with pytest.raises(OutputError, match=r"holds 3 finished tiles of another run: --heights was"):
         run(copied, tmp_path / "out", SMALL_TILES, heights=(20.0, 80.0))
     with pytest.raises(OutputError, match=r"the option pyramid\.tile was 80 there and is"):
         run(copied, tmp_path / "out")
@@ -404,7 +404,7 @@ def test_an_image_that_disappears(images, tmp_path, monkeypatch):
 GOES = {
     "zlocus.pipeline.execution.checkpoint.write_atomically": (
         6,
-        r"tiles has gone since the run began, with 3 finished tiles in it",
+        r"tiles has gone since the run began, with 3 finished tiles",
     ),
     "zlocus.io.rasters._check_written": (1, r"water\.tif cannot be written"),
     "zlocus.pipeline.surface_products.write_observations": (1, r"observations\.npz cannot be written: No such file"),
@@ -452,7 +452,7 @@ def test_a_disk_that_fills(images, straight, tmp_path, monkeypatch):
         write(path, content)
 
     monkeypatch.setattr(store, "write_atomically", until_full)
-    with pytest.raises(StoppedError, match=r"No space left on device\. 2 finished tiles are kept; make room"):
+    with pytest.raises(StoppedError, match=r"No space left on device\. The 2 finished tiles are kept; make room"):
         run(images("sine"), tmp_path / "out", SMALL_TILES, report=False)
     assert n_finished(tmp_path / "out") == 2
     monkeypatch.undo()

@@ -15,7 +15,7 @@ import typer
 from zlocus import __version__
 from zlocus.cli.answer import Answer
 from zlocus.core.errors import ConfigError, OutputError
-from zlocus.core.progress import ManifoldProgress, Progress, SilentProgress, progress_for
+from zlocus.core.progress import KeptNotes, ManifoldProgress, Progress, SilentProgress, progress_for
 
 if TYPE_CHECKING:
     import logging
@@ -58,7 +58,8 @@ class OutputOptions:
 class Console:
     """Says what a command tells its user.
 
-    progress : of the command; is_verbose : whether traces of errors are printed.
+    progress : of the command; is_verbose : whether traces of errors are printed; notes : sentences that were said on
+    the way, warnings among them, kept where --json prints them.
     """
 
     def __init__(self, command: str, options: OutputOptions | None = None, given: dict[str, Any] | None = None) -> None:
@@ -73,12 +74,19 @@ class Console:
         """
         self._command, self._options, self._given = command, options or OutputOptions(), given or {}
         self._log: logging.Logger | None = None
+        self._warnings: logging.Handler | None = None
         self.is_verbose = self._options.verbose
         if self._options.quiet and self.is_verbose:
             raise ConfigError("--quiet and --verbose exclude each other. Leave one out.")
         self.progress: Progress = SilentProgress() if self._options.quiet else progress_for(sys.stderr)
+        self.notes: list[str] = []
         if self._options.log is not None or self.is_verbose:
             self._open_log()
+        if self._options.as_json:
+            from zlocus.cli.log import KeptWarnings
+
+            self.progress = ManifoldProgress((self.progress, KeptNotes(self.notes)))
+            self._warnings = KeptWarnings(self.notes)
 
     def _open_log(self) -> None:
         """Send everything that is said to the log file, and details to the terminal where they are wanted."""
@@ -95,7 +103,9 @@ class Console:
         self._log.debug("%s, Python %s, %s", platform.platform(), platform.python_version(), _versions())
 
     def close(self) -> None:
-        """End the log."""
+        """End the log, and keep no more warnings."""
+        if self._warnings is not None:
+            self._warnings.close()
         if self._log is not None:
             from zlocus.cli.log import close_log
 
@@ -110,11 +120,12 @@ class Console:
         elif answer.is_asked_for or not self._options.quiet:
             print(answer.text)
 
-    def failed(self, sentence: str, status: int) -> None:
-        """Print why the command fails, as the only object with --json. The trace is that of the current exception."""
+    def failed(self, sentence: str, status: int, has_trace: bool = True) -> None:
+        """Print why the command fails, as the only object with --json. has_trace : of the current exception."""
         if self._log is not None:
             self._log.error("zlocus: %s", sentence)
-            self._log.debug("%s", traceback.format_exc().rstrip())
+            if has_trace:
+                self._log.debug("%s", traceback.format_exc().rstrip())
         if self._options.as_json:
             self._print_object(status, {"error": sentence})
 

@@ -193,5 +193,5 @@ def dsm(options: DsmOptions, console: Console) -> Answer:
     result = run_dsm(request, config, console.progress)
     return Answer(
         result.sentence,
-        {"coverage": result.coverage, "was_finished": result.was_finished},
+        {**result.as_dict(), "notes": console.notes},
     )

@@ -50,12 +50,13 @@ def explained(command: Callable[P, R], console: Console | None = None) -> Callab
     return run
 
 
-def _failed(sentence: str, status: int, console: Console | None) -> typer.Exit:
-    if console is not None and console.is_verbose:
+def _failed(sentence: str, status: int, console: Console | None, has_trace: bool = True) -> typer.Exit:
+    """Say why a command ends. has_trace : whether the trace of the current exception tells more than the sentence."""
+    if has_trace and console is not None and console.is_verbose:
         traceback.print_exc()
     _say(f"zlocus: {sentence}")
     if console is not None:
-        console.failed(sentence, status)
+        console.failed(sentence, status, has_trace)
     return typer.Exit(status)
 
 
@@ -66,7 +67,7 @@ def _interrupted(error: KeyboardInterrupt, console: Console | None) -> typer.Exi
     if isinstance(error, Ended):
         end_children()
     try:
-        failed = _failed(sentence_of(number), exit_status(number), console)
+        failed = _failed(sentence_of(number), exit_status(number), console, has_trace=False)
     except OSError:  # the terminal has gone
         leave(exit_status(number))
     if is_busy():

@@ -28,6 +28,25 @@ class _Details(logging.Handler):
                 self._progress.note(record.getMessage())
 
 
+class KeptWarnings(logging.Handler):
+    """Keeps our warnings as sentences, until it is closed."""
+
+    def __init__(self, sentences: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._sentences = sentences
+        logging.getLogger(LOGGER).addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a warning."""
+        if record.levelno == logging.WARNING:
+            self._sentences.append(record.getMessage().removeprefix("zlocus: "))
+
+    def close(self) -> None:
+        """Listen no more."""
+        logging.getLogger(LOGGER).removeHandler(self)
+        super().close()
+
+
 class _LogProgress(LineProgress):
     """Progress as lines of a log."""
 

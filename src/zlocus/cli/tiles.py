@@ -105,7 +105,7 @@ def assemble(options: TilesAssembleOptions, console: Console) -> Answer:
     result = assemble_tasks(options.out, options.partial, console.progress)
     return Answer(
         result.sentence,
-        {"coverage": result.coverage, "was_finished": result.was_finished},
+        {**result.as_dict(), "notes": console.notes},
     )
 
 

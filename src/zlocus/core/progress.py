@@ -56,6 +56,17 @@ class SilentProgress:
         """See `Progress`."""
 
 
+@dataclass
+class KeptNotes(SilentProgress):
+    """Keeps the sentences for the user in a list, and shows nothing."""
+
+    sentences: list[str] = field(default_factory=list)
+
+    def note(self, sentence: str) -> None:
+        """See `Progress`."""
+        self.sentences.append(sentence)
+
+
 class _SilentStage:
     def advance(self, n: float = 1) -> None:
         pass

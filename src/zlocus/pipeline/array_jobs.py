@@ -18,6 +18,7 @@ from typing import Any
 from zlocus.core.errors import ConfigError, CoverageError, OutputError, StoppedError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
+from zlocus.core.quoting import counted
 from zlocus.core.requests import DsmRequest, check_output
 from zlocus.core.resources import cores
 from zlocus.io.input_files import InputFiles
@@ -45,7 +46,7 @@ from zlocus.pipeline.dsm import (
     write_products,
     write_rasters,
 )
-from zlocus.pipeline.execution.checkpoint import FOLDER, TileCheckpoint
+from zlocus.pipeline.execution.checkpoint import FOLDER, TileCheckpoint, kept_tiles
 from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most
 from zlocus.pipeline.execution.tasks import Cause, Failure, Outcome
@@ -83,19 +84,26 @@ class ArrayState:
         """The same for programs: numbers of tasks and tiles, and the numbers of the tasks that are left."""
         array_plan = self.array_plan
         return {
-            "tasks": array_plan.n_tasks, "tiles": len(array_plan.names), "tiles_done": self.n_tiles_done,
-            "left": self.left, "is_assembled": False, "task_mb": round(array_plan.task_mb, 1),
-            "task_s": round(array_plan.task_s, 1), "assemble_s": round(array_plan.assemble_s, 1),
+            "tasks": array_plan.n_tasks, "tasks_with_tiles": len(array_plan.with_work),
+            "tiles": len(array_plan.names), "tiles_done": self.n_tiles_done, "left": self.left, "is_assembled": False,
+            "task_mb": round(array_plan.task_mb, 1), "task_s": round(array_plan.task_s, 1),
+            "assemble_s": round(array_plan.assemble_s, 1),
         }  # fmt: skip
 
     def __str__(self) -> str:
         array_plan, out = self.array_plan, self.array_plan.out
-        n_done = array_plan.n_tasks - len(self.left)
+        n_tasks, n_tiles = len(array_plan.with_work), len(array_plan.names)
+        n_done = n_tasks - len(self.left)
         lines = [
             str(array_plan),
-            f"Done: {n_done} of {array_plan.n_tasks} tasks, {self.n_tiles_done} of {len(array_plan.names)} tiles.",
+            f"Done: {n_done} of {counted(n_tasks, 'task')}, {self.n_tiles_done} of {counted(n_tiles, 'tile')}.",
         ]
-        if self.left:
+        if len(self.left) == 1:
+            (number,) = self.left
+            lines.append(
+                f"Left: task {number}. Run `zlocus tiles run {out} {number}`, then `zlocus tiles assemble {out}`."
+            )
+        elif self.left:
             lines.append(
                 f"Left: tasks {as_ranges(self.left)}. Run `zlocus tiles run {out} N` for each number N of them, in any "
                 f"order and any number at a time; then `zlocus tiles assemble {out}`."
@@ -124,9 +132,10 @@ class TaskResult:
         if not self.n_tiles:
             return f"task {self.number} is finished, for it has no tile: there are more tasks than tiles."
         if not self.n_made:
-            return f"task {self.number} is finished already, {self.n_tiles} of its {self.n_tiles} tiles were there."
-        earlier = f" {self.n_tiles - self.n_made} were there already." if self.n_made < self.n_tiles else ""
-        return f"task {self.number} is finished, {self.n_made} of its {self.n_tiles} tiles made.{earlier}"
+            return f"task {self.number} is finished already, with its {counted(self.n_tiles, 'tile')}."
+        n_earlier = self.n_tiles - self.n_made
+        earlier = f" {n_earlier} {'was' if n_earlier == 1 else 'were'} there already." if n_earlier else ""
+        return f"task {self.number} is finished, {self.n_made} of its {counted(self.n_tiles, 'tile')} made.{earlier}"
 
 
 def plan_tasks(
@@ -372,10 +381,11 @@ def _check_tasks_left(array_plan: ArrayPlan, finished: Sequence[str], partial: b
     if not left or (partial and finished):
         return
     n_tiles, out = len(array_plan.names) - len(finished), array_plan.out
-    also = f", or add --partial for a surface without their {n_tiles} tiles" if finished else ""
+    also = f", or add --partial for a surface without {counted(n_tiles, 'tile')}" if finished else ""
     raise StoppedError(
-        f"{out} cannot be assembled: {len(left)} of {array_plan.n_tasks} tasks are not finished "
-        f"({as_ranges(left, MAX_NAMED_GROUPS)}). Run them with `zlocus tiles run {out} N`{also}; nothing was written."
+        f"{out} cannot be assembled: {len(left)} of {counted(len(array_plan.with_work), 'task')} "
+        f"{'is' if len(left) == 1 else 'are'} not finished ({as_ranges(left, MAX_NAMED_GROUPS)}). Run "
+        f"{'it' if len(left) == 1 else 'them'} with `zlocus tiles run {out} N`{also}; nothing was written."
     )
 
 
@@ -406,7 +416,7 @@ def _assemble(
         return _written(array_plan, prepared_surface, tile_run, failed, stopwatch, progress)
     except OutputError as error:
         raise StoppedError(
-            f"{error} The {len(held)} finished tiles are kept: {checkpoint.how_to_resume}."
+            f"{error} {kept_tiles(len(held))}: {checkpoint.how_to_resume}."
         ) from error  # fmt: skip
     except KeyboardInterrupt:
         tile_run.tell_interrupted(progress)
@@ -435,8 +445,9 @@ def _written(
         lost = {name_of(outcome.task) for outcome in failed_outcomes}
         left = array_plan.left(name for name in array_plan.names if name not in lost)
         raise StoppedError(
-            f"{len(lost)} of {len(array_plan.names)} tiles are empty in the surface (FAILED in quality.tif), for these "
-            f"tasks are not finished: {as_ranges(left, MAX_NAMED_GROUPS)}. Run them, and assemble {request.out} again."
+            f"{len(lost)} of {counted(len(array_plan.names), 'tile')} {'is' if len(lost) == 1 else 'are'} empty in the "
+            "surface (FAILED in quality.tif), for some tasks are not finished: "
+            f"{as_ranges(left, MAX_NAMED_GROUPS)}. Run these, and assemble {request.out} again."
         )
     checkpoint.key["inputs"] = dict(prepared_surface.inputs.states)  # the content is that of the plan
     return finish(prepared_surface, checkpoint, tally, progress)

@@ -16,17 +16,18 @@ import zlocus
 from zlocus.core.errors import ConfigError, InputError, OutputError
 from zlocus.core.jit import kernels_digest
 from zlocus.core.progress import duration
+from zlocus.core.quoting import counted
 from zlocus.core.requests import FINISHED, held_files
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import inputs_record, read_record, versions_record
 from zlocus.io.stored_files import file_state
-from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileCheckpoint, write_atomically
+from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, PLAN, TileCheckpoint, write_atomically
 from zlocus.pipeline.execution.packed_values import packed, unpacked
 from zlocus.pipeline.finished_record import read_finished
 from zlocus.products.report.file_names import RECORD
 
 # Names beside the tiles: what people and programs may read, and everything that tiles and products are made of.
-PLAN, VALUES = "plan.json", "plan.bin"
+VALUES = "plan.bin"
 SCHEMA = 1
 # The entry of run.json that says of how many tasks a surface was made.
 TASKS = "tasks"
@@ -74,6 +75,11 @@ class ArrayPlan:
             )
         first, after = (k * len(self.names) // self.n_tasks for k in (number - 1, number))
         return self.names[first:after]
+
+    @property
+    def with_work(self) -> list[int]:
+        """Numbers of the tasks that have tiles."""
+        return self.left(())
 
     def left(self, finished: Iterable[str]) -> list[int]:
         """Numbers of the tasks that have tiles which are not among those finished."""
@@ -185,15 +191,19 @@ class ArrayPlan:
             yield there
 
     def __str__(self) -> str:
-        tiles = f"{len(self.names)} tile{'s' if len(self.names) != 1 else ''}"
         if not self.n_tasks:
             return f"{self.out}: no tile shows ground that two images see."
         most = most_tiles(len(self.names), self.n_tasks)
-        tasks = f"{self.n_tasks} tasks, numbered from 1 to {self.n_tasks}" if self.n_tasks > 1 else "one task, number 1"
+        tasks = "one task, number 1"
+        if self.n_tasks > 1:
+            tasks = f"{self.n_tasks} tasks, numbered from 1 to {self.n_tasks}, each of at most {counted(most, 'tile')}"
+        if len(self.with_work) < self.n_tasks:
+            number = as_ranges(self.with_work, MAX_NAMED_GROUPS)
+            tasks += f"; only task {number} has any" if len(self.with_work) == 1 else f"; only tasks {number} have any"
         return (
-            f"{self.out}: {tiles} in {tasks}, each of at most {most}. A task needs about {self.task_mb / 1e3:.2g} GB "
-            f"of memory and up to {duration(self.task_s)} of one core; assembling takes about "
-            f"{duration(self.assemble_s)}."
+            f"{self.out}: {counted(len(self.names), 'tile')} in {tasks}. A task needs about "
+            f"{self.task_mb / 1e3:.2g} GB of memory and up to {duration(self.task_s)} of one core; assembling takes "
+            f"about {duration(self.assemble_s)}."
         )
 
 
@@ -258,7 +268,7 @@ class FinishedTasks:
         return {"tasks": self.n_tasks, "left": [], "is_assembled": True, "coverage": self.coverage}
 
     def __str__(self) -> str:
-        tasks = f", assembled from {self.n_tasks} task{'s' if self.n_tasks != 1 else ''}" if self.n_tasks else ""
+        tasks = f", assembled from {counted(self.n_tasks, 'task')}" if self.n_tasks else ""
         return f"{self.out}: already finished{tasks}. Nothing is left."
 
 

@@ -29,7 +29,7 @@ from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.image_space import depth_options, is_by_depth
 from zlocus.matching.quality import Quality
 from zlocus.pipeline.checked_tiles import CheckedTiles, strip_by_strip
-from zlocus.pipeline.execution.checkpoint import TileCheckpoint
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint, kept_tiles
 from zlocus.pipeline.execution.plan import keep_at_most
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
@@ -128,6 +128,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     check_output(request.out, request.overwrite, may_be_same=True)
     keep_at_most()  # an earlier run of this process may have kept less
     watch = Stopwatch()
+    TileCheckpoint.check_free(request.out)
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_cloud_run(request, config, progress)
         reference_names(run.opened_inputs.scene, request.references)  # refuses names that are none
@@ -226,7 +227,7 @@ def tiles_are_kept(checkpoint: TileCheckpoint, image_tiles: Sequence[ImageTile],
         n = len(checkpoint.finished)
         if not (n and checkpoint.is_there):
             raise
-        raise StoppedError(f"{error} The {n} finished tiles are kept: {checkpoint.how_to_resume}.") from error
+        raise StoppedError(f"{error} {kept_tiles(n)}: {checkpoint.how_to_resume}.") from error
 
 
 def remove_earlier_cloud(out: Path) -> None:

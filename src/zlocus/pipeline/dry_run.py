@@ -9,6 +9,7 @@ from typing import Any
 
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress, duration
+from zlocus.core.quoting import counted
 from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupRequest
 from zlocus.io.run_record import Stopwatch
 from zlocus.pipeline.cloud import oriented_cloud
@@ -72,7 +73,7 @@ def plan_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> 
         run = open_cloud_run(request, config, progress)
     cloud = oriented_cloud(request, config, run, Stopwatch(), progress)
     named = ", ".join(cloud.references)
-    lines = [f"Cloud: the pixels of {len(cloud.references)} images ({named}).", *_end_of(cloud.plan, run)]
+    lines = [f"Cloud: the pixels of {counted(len(cloud.references), 'image')} ({named}).", *_end_of(cloud.plan, run)]
     return DryRun("\n".join(lines), {"images": cloud.references, **_plan_values(cloud.plan, run)})
 
 
@@ -111,7 +112,9 @@ def _end_of(plan: Plan, run: OpenRun) -> list[str]:
     if run.finished is not None:
         lines.append("The folder holds this very result already: the command would make what is missing only.")
     elif run.checkpoint.finished:
-        lines.append(f"The folder holds {len(run.checkpoint.finished)} finished tiles of this run, which are kept.")
+        lines.append(
+            f"The folder holds {counted(len(run.checkpoint.finished), 'finished tile')} of this run, kept for it."
+        )
     return [*lines, "Nothing was written."]
 
 

@@ -29,7 +29,7 @@ from zlocus.io.rasters import compression_threads
 from zlocus.io.run_record import Stopwatch, read_record
 from zlocus.io.vertical import VerticalDatum
 from zlocus.io.water_polygons import WaterPolygons
-from zlocus.pipeline.execution.checkpoint import TileCheckpoint
+from zlocus.pipeline.execution.checkpoint import TileCheckpoint, has_plan, kept_tiles
 from zlocus.pipeline.execution.event_log import EventLog
 from zlocus.pipeline.execution.plan import Tile, keep_at_most, plan_tiles
 from zlocus.pipeline.execution.precompile import kernels_compiling
@@ -53,6 +53,7 @@ from zlocus.pipeline.surface_products import (
     write_maps,
     write_points,
     write_report_inputs,
+    written_record,
 )
 from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
@@ -60,6 +61,9 @@ from zlocus.pipeline.water import note_water, water_on_grid
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.water import level_water
+
+# What becomes of a plan of tasks.
+THIS_RUN_INSTEAD = "This run makes it at once, with the tiles that are finished, and removes the plan."
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,13 @@ class DsmResult:
         state = "already finished, " if self.was_finished else ""
         text = f"{self.out}: {state}{100 * self.coverage:.1f} % of the cells seen by two images or more have a height."
         return " ".join(part for part in (text, seen_sentence(self.seen_share)) if part)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The surface for programs: how complete it is, its files and grid, and how long its run took, s."""
+        return {
+            "coverage": round(self.coverage, 6), "was_finished": self.was_finished, "area_seen": self.seen_share,
+            **written_record(self.out),
+        }  # fmt: skip
 
 
 def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmResult:
@@ -109,7 +120,7 @@ def run_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DsmRe
         if not any(tile_run.checkpoint.finished and tile_run.checkpoint.is_there for tile_run in tile_runs):
             raise
         n, checkpoint = len(tile_runs[0].checkpoint.finished), tile_runs[0].checkpoint
-        raise StoppedError(f"{error} The {n} finished tiles are kept: {checkpoint.how_to_resume}.") from error
+        raise StoppedError(f"{error} {kept_tiles(n)}: {checkpoint.how_to_resume}.") from error
     except KeyboardInterrupt:
         for tile_run in tile_runs:
             tile_run.tell_interrupted(progress)
@@ -120,8 +131,11 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
     """See `run_dsm`. tile_runs : takes the run of the tiles once it starts, for messages after an interrupt."""
     watch = Stopwatch()
     check_before_opening(request, config)
+    TileCheckpoint.check_free(request.out)
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_run(request, config, progress)
+    if run.checkpoint.is_of_this_run and has_plan(request.out):
+        progress.note(f"{request.out} holds a plan of tasks for this surface (`zlocus tiles`). {THIS_RUN_INSTEAD}")
     if run.finished is not None:
         missing = missing_products(request, run.finished, progress)
         if not missing.matched:
@@ -216,7 +230,8 @@ def prepare_surface(
     if sentence := seen_sentence(share, "about "):
         progress.note(sentence)
     return PreparedSurface(
-        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, share, water_polygons
+        request, config, opened_inputs.vertical_datum, run.inputs, setup, tiles, plan, job, digest, share,
+        water_polygons,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from zlocus.core.errors import ConfigError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import duration
+from zlocus.core.quoting import counted
 from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.core.resources import DEFAULT_MEMORY_SHARE, TILE_CODE_BYTES, WORKER_BYTES, cores, free_bytes, held_bytes
 from zlocus.core.scene import View
@@ -93,14 +94,14 @@ class Plan:
         }
 
     def __str__(self) -> str:
+        many = counted(self.n_tiles, "tile")
         where = "in processes of their own" if self.processes else "in this process"
         if self.scheduler is not None:
             need = f"{self.tile_bytes / 1e9:.2g} GB of memory for each of its threads"
             whole = f"{duration(self.seconds)} of one of them at the typical rate"
-            return f"Plan: {self.n_tiles} tiles by the cluster at {self.scheduler}, about {need}, and {whole}."
-        many = f"{self.n_tiles} tile{'s' if self.n_tiles != 1 else ''}"
+            return f"Plan: {many} by the cluster at {self.scheduler}, about {need}, and {whole}."
         if self.n_images:
-            many += f" of {self.n_images} image{'s' if self.n_images != 1 else ''}"
+            many += f" of {counted(self.n_images, 'image')}"
         match_s, write_s = self.match_rate.factor * self.match_s, self.write_rate.factor * self.write_s
         parts = [self.match_rate.said("matching", self.match_s), self.write_rate.said("writing", self.write_s)]
         return (

@@ -12,17 +12,24 @@ from zlocus.core.errors import CoverageError, ZlocusError
 from zlocus.core.grid import Grid
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
-from zlocus.core.requests import DsmRequest
+from zlocus.core.requests import FINISHED, DsmRequest
 from zlocus.core.scene import Scene
 from zlocus.io.config import config_as_dict
 from zlocus.io.input_files import InputFiles
 from zlocus.io.masks.image_mask import masked_share
-from zlocus.io.run_record import Stopwatch, origin_record, request_as_dict, versions_record, write_record
+from zlocus.io.run_record import (
+    Stopwatch,
+    origin_record,
+    read_record,
+    request_as_dict,
+    versions_record,
+    write_record,
+)
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.pair_labels import LabelledTies
 from zlocus.orientation.plausibility import Doubt
 from zlocus.pipeline.fingerprint import COMMANDS, kernels_of_package
-from zlocus.pipeline.finished_record import checksum
+from zlocus.pipeline.finished_record import CHECKED, checksum
 from zlocus.pipeline.messages import grave_doubt
 from zlocus.pipeline.run_plan import Plan
 from zlocus.pipeline.setup import RunSetup
@@ -30,7 +37,7 @@ from zlocus.pipeline.tile_run import Tally
 from zlocus.products.acquisitions import acquisition_records
 from zlocus.products.derived import link_all, write_derived
 from zlocus.products.rasters import SurfaceRasters
-from zlocus.products.report.file_names import CURVES
+from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.tie_layers import write_ranking, write_ties
 from zlocus.products.tie_observations import write_observations
 
@@ -168,6 +175,22 @@ def grid_record(grid: Grid, crs: CRS) -> dict[str, Any]:
     """The products' grid."""
     geobox = grid.geobox
     return {"crs": crs.to_string(), "transform": list(geobox.transform)[:6], "shape": list(geobox.shape)}
+
+
+def written_record(out: Path) -> dict[str, Any]:
+    """What a finished run has written to a folder: files, grid and bounds (m), and the time of its stages, s."""
+    record = read_record(out / RECORD)
+    a, _, xmin, _, e, ymax = record["grid"]["transform"]
+    rows, cols = record["grid"]["shape"]
+    return {
+        "run_record": str(out / RECORD),
+        "files": [str(out / name) for name in (*CHECKED, FINISHED) if (out / name).is_file()],
+        "grid": {
+            "crs": record["grid"]["crs"], "shape": [rows, cols],
+            "bounds": [xmin, round(ymax + rows * e, 6), round(xmin + cols * a, 6), ymax],
+        },
+        "wall_s": round(sum(float(stage["wall_s"]) for stage in record["stages"]), 3),
+    }  # fmt: skip
 
 
 def heights_record(setup: RunSetup) -> dict[str, Any]:

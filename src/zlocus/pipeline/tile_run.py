@@ -16,6 +16,7 @@ from zlocus.core.errors import StoppedError
 from zlocus.core.grid import CellWindow, Grid
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.progress import Progress, Stage
+from zlocus.core.quoting import counted
 from zlocus.core.requests import DsmRequest
 from zlocus.io.grid_inputs import cells_inside, dem_datum, read_dem
 from zlocus.io.run_record import WorkerUsage
@@ -162,7 +163,7 @@ class TileRun:
             for outcome in failed_outcomes[:MAX_NAMED_TILES]
         ]
         more = f"; and {len(failed_outcomes) - MAX_NAMED_TILES} more" if len(failed_outcomes) > MAX_NAMED_TILES else ""
-        return f"{len(failed_outcomes)} of {len(self.tiles)} tiles failed: {'; '.join(said)}{more}."
+        return f"{len(failed_outcomes)} of {counted(len(self.tiles), 'tile')} failed: {'; '.join(said)}{more}."
 
     def run(
         self, plan: Plan, workers: AbstractContextManager[Workers], progress: Progress, worker_usage: WorkerUsage
@@ -184,7 +185,9 @@ class TileRun:
                 self.log.remove()
             self.log.add("began", **asdict(plan), tiles_there=self.n_there)
             if len(todo) < len(worked):
-                progress.note(f"{len(worked) - len(todo)} of {len(worked)} tiles are there already.")
+                n_there = len(worked) - len(todo)
+                are = "is" if n_there == 1 else "are"
+                progress.note(f"{n_there} of {counted(len(worked), 'tile')} {are} there already.")
                 self.log.add("resumed", tiles_there=len(worked) - len(todo))
                 stage.advance(len(worked) - len(todo))
             if ready is not None:
@@ -220,8 +223,8 @@ class TileRun:
         """Say, after an interrupt, which tiles are kept."""
         self.log.add("interrupted", tiles_done=self.n_there)
         if self.n_there and self.checkpoint.is_there:
-            done = f"{self.n_there} of {len(self.tiles)} tiles"
-            progress.note(f"{done} are finished and kept: {self.checkpoint.how_to_resume}.")
+            done = f"{self.n_there} of {counted(len(self.tiles), 'tile')} {'is' if self.n_there == 1 else 'are'}"
+            progress.note(f"{done} finished and kept: {self.checkpoint.how_to_resume}.")
 
     def assemble(
         self, failed_outcomes: Sequence[Outcome], rasters: SurfaceRasters, tally: Tally, progress: Progress

@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 
 import zlocus.pipeline.execution.checkpoint as store_module
 from zlocus.core.errors import OutputError, StoppedError
-from zlocus.pipeline.execution.checkpoint import BEFORE, DONE, FOLDER, MANIFEST, TileCheckpoint, difference
+from zlocus.pipeline.execution.checkpoint import (
+    BEFORE,
+    DONE,
+    FOLDER,
+    MANIFEST,
+    TileCheckpoint,
+    difference,
+    kept_tiles,
+)
 
 KEY = {"versions": {"zlocus": "1"}, "request": {"crs": None}, "options": {"a": {"b": 1}}, "inputs": {"i.tif": [5, 6]}}
 ARRAYS = {"height": np.arange(6, dtype=np.float32).reshape(2, 3), "views": np.ones((2, 3), np.uint8)}
@@ -137,7 +145,11 @@ def test_cameras_that_came_out_otherwise_are_noticed(tmp_path):
 
 def test_two_runs_at_once_are_refused(tmp_path):
     one = store(tmp_path)
+    TileCheckpoint.check_free(tmp_path)  # nothing is there
+    assert not list(tmp_path.iterdir())
     with one.open("s"):
+        with pytest.raises(OutputError, match="Another run writes to"):
+            TileCheckpoint.check_free(tmp_path)
         one.keep("0_0", ARRAYS)
         with pytest.raises(OutputError, match="Another run writes to"), store(tmp_path).open("s"):
             pass
@@ -200,7 +212,7 @@ def test_a_full_disk_keeps_what_is_there(tmp_path, monkeypatch):
         held.keep("0_0", ARRAYS)
         monkeypatch.setattr(store_module, "write_atomically", full)
         with pytest.raises(
-            StoppedError, match=r"No space left on device\. 1 finished tiles are kept; make room"
+            StoppedError, match=r"No space left on device\. The one finished tile is kept; make room"
         ) as caught:
             held.keep("0_64", ARRAYS)
     assert caught.value.exit_status == 3
@@ -227,6 +239,14 @@ def test_differences_by_hand():
     assert difference({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 2}}) == ""
     assert difference({"b": {"c": 2}}, {"b": {"c": 2, "d": 3}}) == "b.d was not given there and is 3 now"
     assert "..." in difference({"a": "x" * 100}, {"a": ""})
+
+
+@pytest.mark.parametrize(
+    ("n", "says"),
+    [(0, "No tile was finished yet"), (1, "The one finished tile is kept"), (3, "The 3 finished tiles are kept")],
+)
+def test_the_number_of_tiles_that_are_kept_is_a_sentence(n, says):
+    assert kept_tiles(n) == says
 
 
 def test_processes_join_a_run_and_keep_tiles_side_by_side(tmp_path):

@@ -21,11 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.errors import OutputError, StoppedError
+from zlocus.core.quoting import counted
 
 Arrays = Mapping[str, NDArray[Any]]
 # Names below the folder of a run. Processes that make the tiles of one run together have a list of finished tiles each.
 FOLDER, MANIFEST, DONE, LOCK = "tiles", "manifest.json", "done.jsonl", "lock"
 LISTS = "done*.jsonl"
+# The plan of processes that make the tiles together.
+PLAN = "plan.json"
 # Arrays that were computed before the first tile: the tie points.
 BEFORE = "before.npz"
 SCHEMA = 3
@@ -90,12 +93,25 @@ class TileCheckpoint:
             return store
         if differs and listed:
             raise OutputError(
-                f"{store.folder} holds {len(listed)} finished tiles of another run: {differs}. Give the same "
-                "options as that run, or add --overwrite (in Python: overwrite=True) to start anew."
+                f"{store.folder} holds {counted(len(listed), 'finished tile')} of another run: {differs}. Give the "
+                "same options as that run, or add --overwrite (in Python: overwrite=True) to start anew."
             )
         if not differs:
             store.finished, store.before = listed, str(manifest.get("before", ""))
         return store
+
+    @staticmethod
+    def check_free(out: Path) -> None:
+        """Refuse the folder of a run that another process writes to, before any work. Changes no file.
+
+        Raises
+        ------
+        OutputError
+            Another process writes to the folder.
+        """
+        with suppress(OSError), (out / FOLDER / LOCK).open("r+b") as file:
+            if not _locked(file):
+                raise OutputError(_taken(out))
 
     def arrays_before_tiles(self) -> dict[str, NDArray[Any]] | None:
         """The arrays that an earlier run of the same key computed before its first tile; None where they are missing or
@@ -121,7 +137,7 @@ class TileCheckpoint:
             self._lock = (self.folder / LOCK).open("a+b")
         try:
             if not _locked(self._lock):
-                raise OutputError(f"Another run writes to {self.folder.parent}. Wait for it, or choose another folder.")
+                raise OutputError(_taken(self.folder.parent))
             self._begin(setup_digest, before or {})
             yield self
         except BaseException:
@@ -166,9 +182,9 @@ class TileCheckpoint:
             self.finished = _finished_in(self.folder) if manifest.get("key") == self.key else {}
             if self.finished and manifest.get("setup") != setup_digest:
                 raise OutputError(
-                    f"{self.folder} holds {len(self.finished)} finished tiles for other cameras and heights, as they "
-                    "may be found on another machine. Add --overwrite (in Python: overwrite=True) to start "
-                    "anew, or resume on the first machine."
+                    f"{self.folder} holds {counted(len(self.finished), 'finished tile')} for other cameras and "
+                    "heights, as they may be found on another machine. Add --overwrite (in Python: overwrite=True) to "
+                    "start anew, or resume on the first machine."
                 )
         if not self.finished or self.arrays_before_tiles() is None:
             with _written(self.folder):
@@ -199,12 +215,12 @@ class TileCheckpoint:
         except OSError as error:
             if not self.is_there:
                 raise StoppedError(
-                    f"{self.folder} has gone since the run began, with {len(self.finished)} finished tiles in it. Give "
-                    "the same command again to make them anew."
+                    f"{self.folder} has gone since the run began, with {counted(len(self.finished), 'finished tile')}. "
+                    "Give the same command again to make them anew."
                 ) from error
             raise StoppedError(
-                f"{self.folder} cannot be written: {error.strerror or error}. {len(self.finished)} finished tiles are "
-                "kept; make room, and give the same command again to resume."
+                f"{self.folder} cannot be written: {error.strerror or error}. {kept_tiles(len(self.finished))}; make "
+                "room, and give the same command again."
             ) from error
         self.finished[name] = digest
 
@@ -241,6 +257,23 @@ class TileCheckpoint:
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"
+
+
+def has_plan(out: Path) -> bool:
+    """Whether a run in a folder is planned in tasks."""
+    return (out / FOLDER / PLAN).exists()
+
+
+def _taken(out: Path) -> str:
+    """The sentence about a folder that another process writes to."""
+    return f"Another run writes to {out}. Wait for it, or choose another folder."
+
+
+def kept_tiles(n: int) -> str:
+    """How many tiles a run that stops has finished and keeps, as the begin of a sentence."""
+    if not n:
+        return "No tile was finished yet"
+    return f"The {n} finished tiles are kept" if n > 1 else "The one finished tile is kept"
 
 
 def _packed(arrays: Arrays) -> tuple[memoryview, str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 NAME = "events.jsonl"
+MIN_WITHOUT_DECIMALS = 1e5
 LOGGER = logging.getLogger(__name__)
 
 
@@ -28,7 +29,7 @@ class EventLog:
     def add(self, event: str, **more: Any) -> None:
         """Add an event with the time and some details."""
         record = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **more}
-        LOGGER.debug("Event %s: %s", event, ", ".join(f"{name} {value}" for name, value in more.items()))
+        LOGGER.debug("Event %s: %s", event, ", ".join(f"{name} {_short(value)}" for name, value in more.items()))
         with suppress(OSError), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
 
@@ -49,3 +50,10 @@ class EventLog:
         with suppress(OSError):
             self.path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
         return [events[line] for line in lines]
+
+
+def _short(value: Any) -> Any:
+    """A value for people: large numbers, such as those of bytes, without decimals, others with three."""
+    if not isinstance(value, float):
+        return value
+    return round(value) if abs(value) >= MIN_WITHOUT_DECIMALS else round(value, 3)
