@@ -40,6 +40,22 @@ def test_a_summary_is_printed_and_a_page_is_written(zl, tmp_path):
     assert zl(first, second, "-o", out, "--overwrite").exit_code == 0
 
 
+def test_identical_surfaces_have_no_difference_and_the_rest_of_b_contradicts_nothing(zl, tmp_path):
+    whole = written(tmp_path / "b.tif")
+    with rasterio.open(whole) as file:
+        profile = file.profile | {"width": 20}
+        part = file.read(1)[:, :20]
+    with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
+        file.write(part, 1)
+    lines = zl(tmp_path / "a.tif", whole, "-o", tmp_path / "out").stdout.splitlines()
+    assert "B less A: no difference in any cell with a height in both" in lines
+    assert not any("+0.000" in line or "differences below" in line for line in lines)
+    assert (
+        "The cells of A and B lie on each other where both reach, and are compared as they are. 600 cells of B with a "
+        "height lie outside of the grid of A and are left out."
+    ) in lines
+
+
 def test_surfaces_of_other_ground_are_refused_in_a_sentence(zl, tmp_path):
     out = tmp_path / "out"
     done = zl(written(tmp_path / "a.tif"), written(tmp_path / "b.tif", west=5e5), "-o", out)

@@ -10,8 +10,8 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
-from zlocus.cli.app import COMMANDS, app
-from zlocus.cli.help_text import EXAMPLES, short_help
+from zlocus.cli.app import COMMANDS, app, in_our_words, main
+from zlocus.cli.help_text import EXAMPLES, MAX_WIDTH, short_help
 
 
 def test_the_help_of_dsm_shows_options_in_groups_and_examples():
@@ -37,13 +37,73 @@ def test_no_summary_is_cut_short():
         assert f"{name} {first}" in shown
 
 
+TILES = ("tiles plan", "tiles run", "tiles assemble")
+
+
+def test_every_command_has_an_example():
+    assert set(EXAMPLES) == {*(name for name, _, _ in COMMANDS), *TILES}
+
+
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_are_commands_with_known_options(name):
-    known = CliRunner().invoke(app, [name, "--help"]).stdout
+    shown = CliRunner().invoke(app, [*name.split(), "--help"]).stdout
     for line in inspect.cleandoc(EXAMPLES[name]).splitlines():
-        program, command, *words = line.split()
-        assert (program, command) == ("zlocus", name)
-        assert [word for word in words if word.startswith("-") and word not in known] == []
+        assert line.startswith(f"zlocus {name} ")
+        assert f"  {line}" in shown.splitlines()
+        assert [word for word in line.split() if word.startswith("--") and word not in shown] == []
+
+
+def test_no_line_of_help_is_cut_at_80_columns():
+    for words in ([], ["tiles"], ["dsm"], ["paper"]):
+        lines = CliRunner().invoke(app, [*words, "--help"]).stdout.splitlines()
+        texts = [line for line in lines if not line.startswith(("  zlocus ", "Usage: "))]
+        assert not any(line.endswith("...") for line in texts)
+        assert max(map(len, texts)) <= 80
+
+
+def test_the_help_is_as_wide_as_the_terminal_up_to_a_limit():
+    environment = {**os.environ, "COLUMNS": "300"}
+    words = [sys.executable, "-m", "zlocus", "--help"]
+    lines = subprocess.run(words, capture_output=True, text=True, env=environment).stdout.splitlines()
+    assert 85 < max(map(len, lines)) <= MAX_WIDTH
+
+
+@pytest.mark.parametrize(
+    ("name", "usage"),
+    [
+        ("dsm", "INPUT..."), ("paper", "FIGURE [INPUT...]"), ("tiles plan", "OUT [INPUT...]"), ("tiles run", "OUT N"),
+        ("evaluate", "DSM REFERENCE"),
+    ],
+)  # fmt: skip
+def test_arguments_have_one_form(name, usage):
+    shown = CliRunner().invoke(app, [*name.split(), "--help"]).stdout.splitlines()
+    (line,) = (line for line in shown if line.startswith("Usage: "))
+    assert line.endswith(f" {name} [OPTIONS] {usage}")
+    assert not any("[[" in line or "{" in line for line in shown)
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours"),
+    [
+        ("Input should be a valid integer, unable to parse string as an integer", "a whole number is needed"),
+        ("Input should be a valid number, unable to parse string as a number", "a number is needed"),
+        ("Input should be less than or equal to 65535", "it must be 65535 at most"),
+        ("Input should be one of two", "it must be one of two"),
+        ("No such option: --nope", "No such option: --nope"),
+    ],
+)
+def test_usage_errors_are_in_our_words(theirs, ours):
+    assert in_our_words(theirs) == ours
+
+
+def test_a_task_that_is_no_number_is_said_in_our_words(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["tiles", "run", "out", "five", "--json"])
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert "Input should" not in said.err + said.out
+    assert "a whole number is needed" in said.err
+    assert "a whole number is needed" in said.out
 
 
 def completed(shell: str, words: str, number: int) -> str:

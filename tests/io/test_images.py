@@ -206,7 +206,7 @@ def test_files_that_are_no_images(tmp_path):
     for path, message in (
         (tmp_path / "none.tif", r"There is no image .*none\.tif"),
         (tmp_path, "is a folder"),
-        (text, r"notes\.tif cannot be opened as a raster"),
+        (text, r"notes\.tif cannot be opened as a raster: its format is not known\. Check"),
         (write_image(tmp_path / "c.tif", GREY.astype(np.complex64)), "complex numbers"),
         (pairs_of_integers(tmp_path / "slc.tif"), r"slc\.tif holds complex numbers\. Convert it to intensity first"),
     ):

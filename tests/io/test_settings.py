@@ -37,7 +37,10 @@ def test_a_setting_replaces_the_file_and_an_empty_one_restores_the_default(tmp_p
         ("=3", "--set =3 is no setting"),
         ("pyramid.tyle=3", "--set pyramid.tyle=3: pyramid.tyle is not an option. Did you mean pyramid.tile?"),
         ("pyramid=3", "--set pyramid=3: pyramid must hold named options"),
-        ("pyramid.tile=many", "--set pyramid.tile=many: pyramid.tile = 'many' is of the wrong type"),
+        (
+            "pyramid.tile=many",
+            "--set pyramid.tile=many: pyramid.tile = 'many' is of the wrong type: a whole number is needed.",
+        ),
         ("pyramid.tile=3\nx=4", "is of the wrong type"),
         ("selection.order=no", "--set selection.order=no: "),
     ],

@@ -78,7 +78,11 @@ def test_heights_without_ground_are_blamed_where_ties_lie_elsewhere(images, monk
 
 
 def test_a_crs_made_for_another_part_of_the_earth_is_refused(images, scene):
-    with pytest.raises(ConfigError, match=r"UTM zone 55S.* has no metres where the images lie.* Use EPSG:32632"):
+    says = (
+        r"UTM zone 55S\) is made for 144 to 150 degrees east, 80 to 0 degrees south, and is not true to scale where "
+        r"the images lie, at .* Use EPSG:32632"
+    )
+    with pytest.raises(ConfigError, match=says):
         open_inputs(SetupRequest(images, crs="EPSG:32755"), SilentProgress())
     for fits in ("EPSG:32633", "EPSG:25832", "EPSG:3035"):
         assert open_inputs(SetupRequest(images, crs=fits), SilentProgress()).scene.crs.to_string() == fits

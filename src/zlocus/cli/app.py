@@ -6,6 +6,7 @@ once.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -25,7 +26,7 @@ from zlocus.cli.doctor import DoctorOptions, doctor
 from zlocus.cli.dsm import DsmOptions, dsm
 from zlocus.cli.evaluate import EvaluateOptions, evaluate
 from zlocus.cli.exit_status import show_our_warnings
-from zlocus.cli.help_text import EXAMPLES, GroupedHelp, short_help
+from zlocus.cli.help_text import EXAMPLES, MAX_WIDTH, GroupedHelp, short_help
 from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
 from zlocus.cli.orient import OrientOptions, TiesOptions, orient, ties
@@ -66,13 +67,13 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MAX_WIDTH},
 )
 for name, options, run in COMMANDS:
     app.command(name, cls=GroupedHelp, epilog=EXAMPLES.get(name), short_help=short_help(run))(
         command_of(name, options, run)
     )
-app.add_typer(tiles)
+app.add_typer(tiles, short_help=tiles.info.help)
 
 
 def _print_version(wanted: bool) -> None:
@@ -96,6 +97,23 @@ def command_name(words: Sequence[str]) -> str:
     return " ".join(word for word in words[:n] if not word.startswith("-"))
 
 
+# What the library says of a value that cannot be used, and what we say.
+WRONG_VALUES = {
+    r"Input should be a valid integer.*": "a whole number is needed",
+    r"Input should be a valid number.*": "a number is needed",
+    r"Input should be less than or equal to (\S+)": r"it must be \1 at most",
+    r"Input should be greater than or equal to (\S+)": r"it must be \1 or more",
+    r"Input should ": "it must ",
+}
+
+
+def in_our_words(message: str) -> str:
+    """The message of a usage error, without the words of the library that checks types."""
+    for theirs, ours in WRONG_VALUES.items():
+        message = re.sub(theirs, ours, message)
+    return message
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit, in a process of its own; `arguments` default to those of the process."""
     handle_signals()
@@ -109,6 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         usage: Any = error
         if not hasattr(error, "show"):
             raise
+        usage.message = in_our_words(usage.message)
         usage.show()
         if "--json" in words:
             Console(command_name(words), OutputOptions(as_json=True)).failed(usage.format_message(), usage.exit_code)

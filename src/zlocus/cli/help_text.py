@@ -13,23 +13,61 @@ from zlocus.cli.console import GROUP
 
 # Options without a group of their own, in commands that have few of them.
 OTHER = "Options"
+# Lines of help are at most so wide, however wide the terminal is.
+MAX_WIDTH = 110
 EXAMPLES = {
+    "demo": "zlocus demo -o demo",
     "dsm": """
         zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --dry-run
         zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --resolution 0.5
         zlocus dsm scene.yaml -o surface --dem dem.tif --products hillshade,dtm
         """,
-    "cloud": """
-        zlocus cloud scene.yaml -o cloud --reference img_2 --fill interpolate
+    "products": "zlocus products surface --products contours,dtm",
+    "cloud": "zlocus cloud scene.yaml -o cloud --reference img_2 --fill interpolate",
+    "rerun": "zlocus rerun surface/run.json -o again --inputs images",
+    "curves": """
+        zlocus curves scene.yaml --at 675350 4897120 -o curves
+        zlocus curves img_1.tif img_2.tif --pixel img_1 250 240
         """,
-    "orient": """
-        zlocus orient scene.yaml -o oriented --control points.csv
+    "paper": "zlocus paper figure3 -o paper",
+    "orient": "zlocus orient scene.yaml -o oriented --control points.csv",
+    "ties": "zlocus ties img_1.tif img_2.tif -o ties",
+    "rank": "zlocus rank img_1.tif img_2.tif img_3.tif -o ranking",
+    "doctor": """
+        zlocus doctor img_1.tif img_2.tif
+        zlocus doctor scene.yaml --bounds 675300 4897080 675420 4897170 -o checked
         """,
+    "import": """
+        zlocus import colmap sparse/0 -o scene.yaml --images photos
+        zlocus import eo orientations.csv --crs EPSG:32632 --camera camera.yaml
+        """,
+    "evaluate": """
+        zlocus evaluate surface/dsm.tif reference.tif
+        zlocus evaluate surface/dsm.tif srtm.tif --geoid egm96 --align -o judged
+        """,
+    "compare": "zlocus compare surface other -o comparison",
+    "report": "zlocus report surface --reference reference.tif",
+    "inspect": "zlocus inspect surface --open",
+    "config": "zlocus config -o options.toml",
+    "tiles plan": """
+        zlocus tiles plan surface img_1.tif img_2.tif --tasks 100
+        zlocus tiles plan surface
+        """,
+    "tiles run": "zlocus tiles run surface 17",
+    "tiles assemble": "zlocus tiles assemble surface",
 }
 
 
 class GroupedHelp(TyperCommand):
-    """A command whose help shows the options in groups, each under the heading that the options name."""
+    """A command whose help shows the options in groups, each under the heading that the options name.
+
+    Arguments have one form: NAME, [NAME] where it may be left out, NAME... where there may be several.
+    """
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The words of the line of usage: options first, then the arguments."""
+        arguments = [param for param in self.get_params(ctx) if param.param_type_name == "argument"]
+        return ["[OPTIONS]", *(_usage_of(param, ctx) for param in arguments)]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, and the options group by group, in the order in which groups first appear."""
@@ -53,6 +91,12 @@ def _heading(param: Any) -> str:
     if param.param_type_name == "argument":
         return "Arguments"
     return GROUP if param.name == "help" else getattr(param, "rich_help_panel", None) or OTHER
+
+
+def _usage_of(param: Any, ctx: Any) -> str:
+    """An argument in the line of usage."""
+    name = f"{_record(param, ctx)[0]}{'...' if param.nargs == -1 else ''}"
+    return name if param.required else f"[{name}]"
 
 
 def _record(param: Any, ctx: Any) -> tuple[str, str]:

@@ -25,7 +25,7 @@ class PaperOptions:
         list[Path] | None,
         typer.Argument(
             help="Images with RPC, or one scene.yaml. Default: the demo's block, rendered into OUT/scene.",
-            metavar="[INPUT]",
+            metavar="INPUT",
         ),
     ] = None
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables and figures.")] = Path("paper")

@@ -12,7 +12,7 @@ from zlocus.cli.answer import Answer
 from zlocus.cli.commands import Command, command_of, config_of
 from zlocus.cli.console import Console
 from zlocus.cli.dsm import DsmOptions, dsm_request
-from zlocus.cli.help_text import GroupedHelp, short_help
+from zlocus.cli.help_text import EXAMPLES, GroupedHelp, short_help
 from zlocus.cli.shared_options import Partial
 from zlocus.core.errors import ConfigError
 
@@ -115,4 +115,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("assemble", TilesAssembleOptions, assemble),
 )
 for name, options, command in COMMANDS:
-    tiles.command(name, cls=GroupedHelp, short_help=short_help(command))(command_of(f"tiles {name}", options, command))
+    full_name = f"tiles {name}"
+    tiles.command(name, cls=GroupedHelp, epilog=EXAMPLES[full_name], short_help=short_help(command))(
+        command_of(full_name, options, command)
+    )

@@ -9,7 +9,8 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -23,6 +24,8 @@ COMMENT_WIDTH = 100
 # A complete configuration has a tenth of this.
 MAX_CONFIG_BYTES = 200_000
 HEADING = "# Every option of zlocus, in TOML. What is left out keeps its default; read with --config FILE.toml."
+# Types of options, as users call them.
+KIND_WORDS: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 T = TypeVar("T")
 
 
@@ -119,8 +122,13 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
         # For JSON, pydantic's strict mode accepts lists for tuples, which is what TOML and YAML can express.
         return TypeAdapter(kind).validate_json(json.dumps(value), strict=True)
     except (ValidationError, TypeError) as error:
-        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else "Input should be a plain value"
-        raise ConfigError(f"{where} = {value!r} is of the wrong type: {reason[0].lower()}{reason[1:]}.") from error
+        raise ConfigError(f"{where} = {value!r} is of the wrong type: {_in_words(kind)} is needed.") from error
+
+
+def _in_words(kind: Any) -> str:
+    """A type of an option, as a user calls it. An option that may be unset has the type of its values."""
+    kinds = [part for part in get_args(kind) if part is not NoneType] if isinstance(kind, UnionType) else [kind]
+    return " or ".join(KIND_WORDS.get(each, "a list of texts") for each in kinds)
 
 
 def _check_renamed(key: str, value: Any, where: str) -> None:

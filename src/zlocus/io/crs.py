@@ -22,6 +22,8 @@ LOCAL = (
 # Semi-major axis of the Earth, and the largest difference from it of ellipsoids and spheres in use.
 EARTH_MAJOR_M, MAX_MAJOR_DIFFERENCE_M = 6378137.0, 3e4
 MAX_CRS_NAME_CHARACTERS = 80
+# Names of positive and negative longitudes and latitudes.
+EAST_WEST, NORTH_SOUTH = ("east", "west"), ("north", "south")
 # A metre of a CRS may differ from one on the ground by this share. National grids and UTM zones differ by less than
 # half of it, also in the neighbouring zone.
 MOST_SCALE_ERROR = 0.02
@@ -97,18 +99,33 @@ def check_fits(crs: CRS, lon: float, lat: float) -> None:
     if all(abs(scale - 1.0) <= MOST_SCALE_ERROR for scale in scales):
         return
     area = crs.area_of_use
-    made_for = "" if area is None else f", which is made for {_degrees(area.bounds)}"
+    made_for = "" if area is None else f" is made for {_degrees(area.bounds)}, and"
     zone = utm_zone(lon, lat)
     raise ConfigError(
-        f"The CRS {quoted(crs.to_string())} ({crs.name[:MAX_CRS_NAME_CHARACTERS]}){made_for}, has no metres where the "
-        f"images lie, {lon:.2f} degrees east, {lat:.2f} degrees north. Use {zone.to_string()}, or leave --crs out."
+        f"The CRS {quoted(crs.to_string())} ({crs.name[:MAX_CRS_NAME_CHARACTERS]}){made_for} is not true to scale "
+        f"where the images lie, at {_degree(lon, EAST_WEST)}, {_degree(lat, NORTH_SOUTH)}. Use {zone.to_string()}, or "
+        "leave --crs out."
     )
 
 
 def _degrees(bounds: tuple[float, float, float, float]) -> str:
     """Bounds in degrees, in words."""
     west, south, east, north = bounds
-    return f"{west:g} to {east:g} degrees east, {south:g} to {north:g} degrees north"
+    return f"{_span(west, east, EAST_WEST)}, {_span(south, north, NORTH_SOUTH)}"
+
+
+def _span(low: float, high: float, names: tuple[str, str]) -> str:
+    """Two angles, degrees, in words: 0 to 6 degrees east, 80 to 0 degrees south. names : of positive and negative."""
+    if low >= 0:
+        return f"{low:g} to {high:g} degrees {names[0]}"
+    if high <= 0:
+        return f"{abs(low):g} to {abs(high):g} degrees {names[1]}"
+    return f"{abs(low):g} degrees {names[1]} to {high:g} degrees {names[0]}"
+
+
+def _degree(angle: float, names: tuple[str, str]) -> str:
+    """An angle, degrees, in words. names : of positive and negative ones."""
+    return f"{abs(angle):.2f} degrees {names[angle < 0]}"
 
 
 def raster_crs(source: rasterio.DatasetReader, path: Path) -> CRS:

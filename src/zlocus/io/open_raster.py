@@ -160,9 +160,10 @@ def _dataset(path: Path, name: str, is_list: bool) -> rasterio.DatasetReader:
     except (RasterioError, CPLE_BaseError, OSError, UnicodeDecodeError) as error:
         if not is_list and not is_remote(path) and is_virtual(first_bytes(path)):
             raise InputError(f"{path} is a list of other files. Call it .vrt, if that is meant.") from error
+        reason = _without_name(gdal_message(error), name)
         raise InputError(
-            f"{path} cannot be opened as a raster: {gdal_message(error)}. Check that it is a complete "
-            "GeoTIFF (or another format of GDAL)."
+            f"{path} cannot be opened as a raster: {reason}. Check that it is a complete GeoTIFF (or another format of "
+            "GDAL)."
         ) from error
 
 
@@ -305,6 +306,13 @@ def _check_png(path: Path) -> None:
                     f"{path} is truncated: it has {length} bytes, and ends before its last chunk. Copy it again from "
                     "its source."
                 )
+
+
+def _without_name(message: str, name: str) -> str:
+    """A message of GDAL without the name of the file at its begin, which the sentence names already."""
+    for start in (f"'{name}' ", f"`{name}' ", f"{name}: ", f"{name} "):
+        message = message.removeprefix(start)
+    return message.replace("not recognized as being in a supported file format", "its format is not known")
 
 
 def gdal_message(error: BaseException) -> str:

@@ -87,7 +87,7 @@ def test_a_run_and_itself_are_the_same(runs):
     assert "the heights are the same. Both runs have the same options." in context["summary"]
     assert context["where"] is None
     assert context["options"] == []
-    assert context["grid"] == "A and B have the same cells, which are compared as they are."
+    assert context["grid"] == "The cells of A and B lie on each other where both reach, and are compared as they are."
     assert saturated_difference_m(same.differences) == 0.05
 
 

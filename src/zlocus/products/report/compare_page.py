@@ -209,7 +209,7 @@ def grid_sentence(differences: SurfaceDifferences) -> str:
     if differences.n_elsewhere:
         beyond = f" {differences.n_elsewhere} cells of B with a height lie outside of the grid of A and are left out."
     if differences.same_cells:
-        return f"A and B have the same cells, which are compared as they are.{beyond}"
+        return f"The cells of A and B lie on each other where both reach, and are compared as they are.{beyond}"
     how = (
         f"each cell of A is compared with the mean of B at {differences.places_per_cell} places in it"
         if differences.places_per_cell > 1
@@ -288,17 +288,12 @@ def _histogram(differences: SurfaceDifferences) -> maps.Picture:
 
 def comparison_text(runs: ComparedRuns) -> Sequence[str]:
     """The comparison in lines of text, for the command line."""
-    differences, statistics = runs.differences, runs.differences.statistics
+    differences = runs.differences
     counts = [int(np.count_nonzero(each)) for each in (differences.only_first, differences.only_second)]
     lines = [
         f"A: {runs.first.path}", f"B: {runs.second.path}", grid_sentence(differences),
         f"cells with a height: {differences.n_both} in both, {counts[0]} in A only, {counts[1]} in B only",
-        f"B less A: median {statistics.median:+z.3f} m, NMAD {statistics.nmad:.3f} m, RMSE {statistics.rmse:.3f} m, "
-        f"LE90 {statistics.le90:.3f} m",
-        "differences below " + ", ".join(
-            f"{limit:g} m: {words.percent(share, 1)}" for limit, share in sorted(statistics.shares)
-        ),
-        *differences.assumed,
+        *_difference_lines(differences), *differences.assumed,
     ]  # fmt: skip
     if runs.run_records is not None:
         first, second = runs.run_records
@@ -310,6 +305,20 @@ def comparison_text(runs: ComparedRuns) -> Sequence[str]:
             f"inputs that differ: {len(records.input_differences(first, second)) or 'none'}",
         ]
     return lines
+
+
+def _difference_lines(differences: SurfaceDifferences) -> list[str]:
+    """The statistics of the differences in lines of text."""
+    statistics = differences.statistics
+    if differences.lowest_m == differences.highest_m == 0.0:
+        return ["B less A: no difference in any cell with a height in both"]
+    return [
+        f"B less A: median {statistics.median:+z.3f} m, NMAD {statistics.nmad:.3f} m, RMSE {statistics.rmse:.3f} m, "
+        f"LE90 {statistics.le90:.3f} m",
+        "differences below " + ", ".join(
+            f"{limit:g} m: {words.percent(share, 1)}" for limit, share in sorted(statistics.shares)
+        ),
+    ]  # fmt: skip
 
 
 def comparison_values(runs: ComparedRuns) -> dict[str, Any]:
