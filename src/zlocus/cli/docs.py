@@ -16,7 +16,7 @@ class DocsOptions:
     """Arguments of `zlocus docs`."""
 
     page: Annotated[
-        str | None, typer.Argument(metavar="[PAGE]", help="A page, such as quality or how-to/scripts; none lists all.")
+        str | None, typer.Argument(metavar="PAGE", help="A page, such as quality or how-to/scripts; none lists all.")
     ] = None
 
 

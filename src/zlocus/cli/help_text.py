@@ -49,6 +49,10 @@ EXAMPLES = {
     "report": "zlocus report surface --reference reference.tif",
     "inspect": "zlocus inspect surface --open",
     "config": "zlocus config -o options.toml",
+    "docs": """
+        zlocus docs
+        zlocus docs quality
+        """,
     "tiles plan": """
         zlocus tiles plan surface img_1.tif img_2.tif --tasks 100
         zlocus tiles plan surface
