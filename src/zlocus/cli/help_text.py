@@ -49,10 +49,7 @@ EXAMPLES = {
     "report": "zlocus report surface --reference reference.tif",
     "inspect": "zlocus inspect surface --open",
     "config": "zlocus config -o options.toml",
-    "docs": """
-        zlocus docs
-        zlocus docs quality
-        """,
+    "docs": "zlocus docs how-to/deliveries",
     "tiles plan": """
         zlocus tiles plan surface img_1.tif img_2.tif --tasks 100
         zlocus tiles plan surface
