@@ -117,7 +117,10 @@ def test_without_an_edge_the_mean_of_the_block_is_right(tmp_path):
     truth[:, ::2] += 0.4
     reference = write(tmp_path / "t.tif", truth, from_origin(WEST, NORTH, 0.25, 0.25))
     dsm = write(tmp_path / "d.tif", np.full((40, 40), 10.4, np.float32))
-    assert evaluate(dsm, Comparison(reference, margin_m=0)).statistics.median == pytest.approx(0.2, abs=1e-5)
+    result = evaluate(dsm, Comparison(reference, margin_m=0))
+    assert result.statistics.median == pytest.approx(0.2, abs=1e-5)
+    assert repr(result).startswith("Evaluation(absolute: ")
+    assert ", 100.0 % within 1 m, median 0.200 m, NMAD 0.000 m, RMSE 0.200 m)" in repr(result)
 
 
 def test_classes_are_judged_apart(tmp_path, hills):

@@ -36,7 +36,7 @@ class ErrorMap:
     errors: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """Accuracy of a surface against a reference, as it lies and after the best shift was removed.
 
@@ -64,6 +64,16 @@ class Evaluation:
     geoid_added_to: Path | None = None
     places_per_block: tuple[int, int] | None = None
     error_map: ErrorMap | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """One line: the main figures, without those of classes and slopes."""
+        found = self.statistics
+        kind = "aligned" if self.is_aligned else "absolute"
+        return (
+            f"Evaluation({kind}: {found.n} cells, {100 * found.completeness:.1f} % with a height, "
+            f"{100 * found.within:.1f} % within {self.threshold_m:g} m, median {found.median:.3f} m, "
+            f"NMAD {found.nmad:.3f} m, RMSE {found.rmse:.3f} m)"
+        )
 
     @property
     def main_accuracy(self) -> Accuracy:
