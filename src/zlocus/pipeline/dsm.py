@@ -59,7 +59,7 @@ from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
 from zlocus.pipeline.water import note_water, water_on_grid
 from zlocus.products.derived import check_derived
-from zlocus.products.report.file_names import RECORD
+from zlocus.products.report.file_names import RECORD, REPORT
 from zlocus.products.water import level_water
 
 # What becomes of a plan of tasks.
@@ -82,10 +82,12 @@ class DsmResult:
 
     @property
     def sentence(self) -> str:
-        """How complete the surface is."""
+        """How complete the surface is, and where to read more."""
         state = "already finished, " if self.was_finished else ""
         text = f"{self.out}: {state}{100 * self.coverage:.1f} % of the cells seen by two images or more have a height."
-        return " ".join(part for part in (text, seen_sentence(self.seen_share)) if part)
+        report = self.out / REPORT
+        where = f"See {report}." if report.is_file() else ""
+        return " ".join(part for part in (text, seen_sentence(self.seen_share), where) if part)
 
     def as_dict(self) -> dict[str, Any]:
         """The surface for programs: how complete it is, its files and grid, and how long its run took, s."""
