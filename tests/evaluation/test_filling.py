@@ -17,8 +17,9 @@ from zlocus.evaluation.spread import LeastSpread
 @pytest.fixture
 def coarse(tmp_path):
     """A reference of 40 x 40 cells of 30 x 20 m, in whose first cells a surface may lie."""
-    heights = np.random.default_rng(1).normal(100, 10, (40, 40)).astype(np.float32)
-    return write(tmp_path / "r.tif", heights, from_origin(WEST, NORTH, 20, 30))
+    row, col = np.mgrid[:40, :40]
+    heights = 100 + 20 * np.sin(row / 4) + 20 * np.sin(col / 5)  # on which a shift could be found
+    return write(tmp_path / "r.tif", heights.astype(np.float32), from_origin(WEST, NORTH, 20, 30))
 
 
 def surface(tmp_path, shape, left_m, top_m):

@@ -9,7 +9,7 @@ from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.mvs3dm import Mvs3dm
 from zlocus.evaluation.shift import Shift
 from zlocus.evaluation.statistics import ErrorStatistics
-from zlocus.evaluation.table import KINDS, accuracy_table, evaluation_table
+from zlocus.evaluation.table import KINDS, accuracy_table, evaluation_table, main_figures_line
 
 MAX_LINE = 100
 
@@ -103,3 +103,26 @@ def test_a_median_of_nearly_nothing_has_no_sign():
     text = evaluation_table(found)
     assert "-0.000" not in text
     assert math.isclose(found.aligned_accuracy.statistics.median, -1e-5)
+
+
+def test_a_share_of_all_but_one_cell_is_not_all():
+    nearly, hardly = ErrorStatistics(10**6, 1 - 1e-6, 1e-6, *[0.1] * 5), ErrorStatistics(9, 1.0, 0.0, *[0.1] * 5)
+    for statistics, complete, within in ((nearly, "> 99.99 %", "< 0.01 %"), (hardly, "100.00 %", "0.00 %")):
+        (row, *_) = accuracy_table(evaluation(absolute_accuracy=Accuracy(statistics))).rows
+        assert (row[0][2], row[1][0]) == (complete, within)
+
+
+def test_the_main_figures_are_named():
+    assert main_figures_line(evaluation()).endswith("--align or --coregister makes them the aligned ones")
+    assert main_figures_line(evaluation(is_aligned=True)).endswith("the aligned ones, because of --align")
+    fitted = Shift(0.7, -1.2, 0.4, "nuth-kaab", 4, 0.01)
+    line = main_figures_line(evaluation(is_aligned=True, found_shift=fitted))
+    assert line.endswith("the aligned ones, because of --coregister nuth-kaab")
+
+
+def test_figures_and_bands_that_need_words_have_them():
+    lines = evaluation_table(evaluation()).splitlines()
+    assert "MVS3DM: as that benchmark counts, single cells within 1 m, and the median of absolute errors" in lines
+    assert any(
+        line.startswith("slope unknown: a neighbour of the cell has no height in the reference") for line in lines
+    )

@@ -149,4 +149,4 @@ def test_strips_of_line_scanners_that_look_down_see_heights_between_them():
 
 def test_large_cells_do_not_make_images_look_along_one_line():
     views = (view("a", 10), view("b", -10))
-    assert height_step(views, 50.0, 5000.0, 0.5) == pytest.approx(2500 / (2 * np.tan(np.deg2rad(10))), rel=1e-3)
+    assert height_step(views, 50.0, 50_000.0, 0.5) == pytest.approx(25_000 / (2 * np.tan(np.deg2rad(10))), rel=1e-3)

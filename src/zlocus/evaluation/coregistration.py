@@ -127,7 +127,7 @@ def _check_enough(surface: HeightRaster, n: int) -> None:
     if n < MIN_BLOCKS:
         raise InputError(
             f"{surface.path} and the reference have {n} blocks with a slope in common, fewer than the {MIN_BLOCKS} "
-            "that co-registration needs. Check that they overlap, or judge it as it is."
+            "that co-registration needs. Compare a larger surface or a finer reference, or judge it as it is."
         )
 
 
