@@ -16,6 +16,7 @@ from zlocus.matching.occlusion import (
     EDGE_PX,
     covered_heights,
     covers,
+    exclude_views_of_one_direction,
     in_level_indices,
     keep_enough_views,
     mark_occlusions,
@@ -50,6 +51,24 @@ def tile(sensors, valid=None):
     )
     z = (ORIGIN_M, ORIGIN_M + N_STEPS * STEP_M)
     return tile_views(windows, TileGrid(0, transform, SHAPE, BLOCK, ORIGIN_M, STEP_M), z, 2), lattice, transform
+
+
+def test_cells_that_views_of_one_direction_show_alone_are_covered_by_none():
+    """Two views from one point of the orbit, and a third one that shows the western part only."""
+    views, lattice, _ = tile([sensor(), sensor(0.05), sensor(12)])
+    visible = covered_heights(views, FLAT, lattice)
+    visible.lowest_covered[2, :, 20:], visible.highest_covered[2, :, 20:] = NEVER_COVERED, NEVER_OCCLUDED
+    exclude_views_of_one_direction(visible, views, CELL_M / STEP_M)
+    covered = covers(visible)
+    assert covered[:, :, :20].all()
+    assert not covered[:, :, 20:].any()
+
+
+def test_narrow_pairs_that_tell_heights_stay():
+    views, lattice, _ = tile([sensor(), sensor(1.0)])
+    visible = covered_heights(views, FLAT, lattice)
+    exclude_views_of_one_direction(visible, views, CELL_M / STEP_M)
+    assert covers(visible).all()
 
 
 def test_all_is_covered_well_inside_the_image():

@@ -25,9 +25,11 @@ from zlocus.core.request_checks import (
 RUN_FILES = ("run.json", "dsm.tif", "cloud.laz", "point.json", "ranking.json", "orientation.json", "scene.yaml")
 # Files of a demo: the first marks its folder; the last holds the accuracy against the truth and ends the demo.
 DEMO_BEGUN, DEMO_ACCURACY = "demo.json", "accuracy.json"
-# The record of a finished surface: everything that it depends on, and the checksums of its products.
+# The events of a run as lines of JSON, from its first second on.
+EVENTS = "events.jsonl"
 # What to do about a folder that holds another result.
 OTHER_FOLDER = "Choose another folder, or add --overwrite (in Python: overwrite=True)."
+# The record of a finished surface: everything that it depends on, and the checksums of its products.
 FINISHED = "finished.json"
 VIEWS = ("auto", "all")
 METHODS = ("mvll-sgm", "mvll", "gc3-sgm", "gc3")

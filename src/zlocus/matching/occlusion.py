@@ -19,12 +19,20 @@ from zlocus.matching.kernels.occlusion import (
 from zlocus.matching.kernels.shared_records import NEVER_COVERED, NEVER_OCCLUDED, CellBox, VisibleHeights
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
-from zlocus.matching.view_directions import cells_along_rays, cells_per_step, parts_of_one_direction
+from zlocus.matching.view_directions import (
+    cells_along_rays,
+    cells_per_step,
+    directions_of_blocks,
+    parts_of_one_direction,
+)
 
 # Pixels along the edge of every image that are not used.
 EDGE_PX = 3.0
 # A height takes two views.
 PAIR = 2
+# Views whose base-to-height is smaller tell no height: a match off by a third of a pixel would put it off by more than
+# thirty pixels.
+MIN_BASE_TO_HEIGHT = 0.01
 # Where so many views cover the cells of a tile, none is excluded where a surface occludes it: a tower that is too wide
 # would exclude just those that see the ground beside it. There the best of the pairs count, which are those without
 # occluded views anyway.
@@ -49,6 +57,28 @@ def covered_heights(
         visible.highest_covered,
     )  # fmt: skip
     return visible
+
+
+def exclude_views_of_one_direction(visible: VisibleHeights, tile_views: TileViews, steps_per_cell: float) -> None:
+    """Let no view cover the cells whose views all look along nearly the same line; changes `visible`.
+
+    Such views are alike at every height, so that any height would do: a copy of an image, or a second image from the
+    same point of the orbit. steps_per_cell : side of a cell in height steps.
+    """
+    n_views = len(visible.lowest_covered)
+    middle = np.array([cells_per_step(tile_views, view) for view in range(n_views)]) * steps_per_cell
+    apart = np.hypot(*np.moveaxis(middle[:, None] - middle[None], -1, 0))[np.triu_indices(n_views, 1)]
+    # Directions turn a little within a tile.
+    if not (apart < 2 * MIN_BASE_TO_HEIGHT).any():
+        return
+    covered, shape = covers(visible), visible.lowest_covered.shape[1:]
+    low, high = np.full((2, *shape), np.inf, np.float32), np.full((2, *shape), -np.inf, np.float32)
+    for view, by_block in enumerate(directions_of_blocks(tile_views) * steps_per_cell):
+        direction = _cells_of(np.moveaxis(by_block, -1, 0).astype(np.float32), tile_views.block, shape)
+        np.minimum(low, direction, out=low, where=covered[view])
+        np.maximum(high, direction, out=high, where=covered[view])
+    is_alike = (covered.sum(axis=0) >= PAIR) & (np.hypot(*np.subtract(high, low)) < MIN_BASE_TO_HEIGHT)
+    exclude(visible, covered & is_alike)
 
 
 def excluded_view_mask(tile_views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:

@@ -39,6 +39,7 @@ from zlocus.matching.occlusion import (
     PAIR,
     covered_heights,
     covers,
+    exclude_views_of_one_direction,
     in_level_indices,
     keep_enough_views,
     mark_occlusions,
@@ -351,9 +352,12 @@ def visible_heights(tile: TileInputs, level: PyramidLevel, search: LevelSearch, 
     """Visible height ranges of all views, slope indices.
 
     Where a surface is known and there are three views or more, but not many, heights at which it occludes a view are
-    excluded.
+    excluded, and where all views look along one line, none takes part.
     """
     visible = covered_heights(search.slope_views, search.slope_surface, search.lattice)
+    exclude_views_of_one_direction(
+        visible, search.tile_views, tile.match_scene.cell_size / tile.match_scene.height_step
+    )
     are_few = usual_number(visible, level.core) < MANY_VIEWS
     if prior.surface is not None and tile.handles_occlusion and are_few:
         occluder = cv2.erode(prior.surface, prior.erosion)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from zlocus.core.errors import InputError
-from zlocus.core.requests import FINISHED
+from zlocus.core.requests import EVENTS, FINISHED
 from zlocus.io.run_record import finite_only, write_record
 from zlocus.io.safe_documents import read_json
-from zlocus.pipeline.execution.event_log import NAME as EVENTS
 from zlocus.products.stac_item import PRODUCTS
 
 ITEM = "item.json"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import tarfile
 from dataclasses import replace
 
@@ -194,6 +195,34 @@ def test_what_is_left_out_is_named(taken, tmp_path):
     )
     with pytest.warns(ZlocusWarning, match="Left out: dem_0.tif"):
         open_scene([tmp_path])
+
+
+def test_a_view_whose_time_alone_is_not_known_has_the_name_of_its_product(taken, tmp_path):
+    for shot in taken:
+        write_single(tmp_path, shot)
+    (tmp_path / "dates.csv").write_text("image,date\nnadir.tif,2014-10-05\nfore.tif,2014-10-05T16:01:38Z\n")
+    assert {view.name for view in open_delivery(tmp_path).views} == {"nadir", "20141005T160138"}
+
+
+def test_of_two_orders_each_image_takes_the_colours_of_its_own(made, taken, tmp_path):
+    """Two satellites that took images at the same times: the cameras of both colours would fit."""
+    for vendor in ("maxar", "dimap"):
+        shutil.copytree(made(vendor), tmp_path / vendor)
+    views = open_delivery(tmp_path).views
+    assert len(views) == 2 * len(taken)
+    for view in views:
+        assert view.partner.image.acquisition.satellite == view.image.acquisition.satellite
+
+
+def test_results_of_zlocus_are_no_part_of_a_delivery(taken, tmp_path):
+    for shot in taken:
+        write_single(tmp_path, shot)
+    (tmp_path / "surface").mkdir()
+    write_image(tmp_path / "surface" / "dsm.tif", taken[0].grey)
+    (tmp_path / "surface" / "events.jsonl").touch()
+    delivery = open_delivery(tmp_path)
+    assert len(delivery.views) == 2
+    assert not delivery.set_aside
 
 
 def test_what_is_a_delivery(tmp_path, made):

@@ -246,6 +246,18 @@ def test_assets_of_stac_elsewhere(taken, tmp_path, href, says):
     assert says in refused(catalogue.parent)
 
 
+def test_a_catalogue_whose_item_is_missing(taken, tmp_path):
+    catalogue = stac_delivery(tmp_path / "c", taken)
+    one(catalogue.parent, "item.json").unlink()
+    assert "item.json', which is missing" in refused(catalogue)
+    assert "item.json', which is missing" in refused(catalogue.parent)
+    document = json.loads(catalogue.read_text())
+    for link in document["links"]:
+        link["href"] = f"https://server/{link['href']}"
+    catalogue.write_text(json.dumps(document))
+    assert "pan.tif" not in str(open_delivery(catalogue.parent).set_aside)
+
+
 def test_catalogues_that_lead_back_or_are_none(taken, tmp_path):
     catalogue = stac_delivery(tmp_path / "c", taken)
     document = json.loads(catalogue.read_text())

@@ -146,10 +146,7 @@ def _names(images: Sequence[DeliveredImage]) -> dict[str, str]:
     other image has it."""
     acquired = {image.product: _name_of(image.acquisition) for image in images}
     count = Counter(acquired.values())
-    return {
-        image.product: acquired[image.product] if count[acquired[image.product]] == 1 else image.product
-        for image in images
-    }
+    return {product: name if name and count[name] == 1 else product for product, name in acquired.items()}
 
 
 def _name_of(acquisition: Acquisition) -> str:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from zlocus.core.errors import InputError
+from zlocus.core.requests import EVENTS
 from zlocus.io.archives import MAX_MEMBERS, is_archived, members, path_in_archive, stored_file
 
 # Folders in folders; deliveries of vendors have five.
@@ -17,7 +18,8 @@ HIDDEN = (".", "__MACOSX")
 def files_in(path: Path) -> tuple[Path, ...]:
     """The files of a folder, or of an archive, in order of their names. Hidden files are left out.
 
-    A link to a folder is not followed, because it may lead back.
+    A link to a folder is not followed, because it may lead back. A folder with a result of zlocus in it is no part of
+    the delivery.
 
     Raises
     ------
@@ -39,6 +41,9 @@ def _in_folder(folder: Path) -> tuple[Path, ...]:
     found: list[Path] = []
     for at, names, files in os.walk(folder, onerror=refuse):
         here = Path(at)
+        if EVENTS in files and here != folder:
+            names.clear()
+            continue
         deep = len(here.relative_to(folder).parts)
         names[:] = sorted(name for name in names if not _is_hidden([name]))
         if deep >= MAX_DEPTH and names:

@@ -57,7 +57,16 @@ def colour_partner(image: DeliveredImage, images: Sequence[DeliveredImage]) -> C
     coloured = [each for each in images if each.spectrum is Spectrum.MULTISPECTRAL and each.colour_bands is not None]
     of_pass = [each for each in coloured if _may_be_of_one_pass(image, each)]
     found = [partner for each in of_pass if (partner := _partner(image, each)) is not None]
-    return min(found, key=lambda partner: partner.distance_px, default=None)
+    return min(found, key=lambda partner: _apart(image, partner), default=None)
+
+
+def _apart(image: DeliveredImage, partner: ColourPartner) -> tuple[bool, int, float]:
+    """How far an image and a partner are from being of one product: of two orders in one folder, or twice the same one,
+    each image takes the colours of its own."""
+    other = partner.image
+    is_of_other = image.acquisition.satellite != other.acquisition.satellite
+    n_folders = sum(other.pixels.is_relative_to(folder) for folder in image.pixels.parents)
+    return is_of_other, -n_folders, partner.distance_px
 
 
 def _may_be_of_one_pass(image_a: DeliveredImage, image_b: DeliveredImage) -> bool:

@@ -34,7 +34,13 @@ ADVICE = "Copy the catalogue again from its source, with its images."
 
 
 def stac_products(files: Sequence[Path]) -> Found:
-    """The images of all STAC items among the files of a delivery."""
+    """The images of all STAC items among the files of a delivery.
+
+    Raises
+    ------
+    InputError
+        An item names a file that is missing, outside the delivery or on a server; a catalogue names an item that is.
+    """
     images: list[DeliveredImage] = []
     root = _common_folder(files)
     for path in files:
@@ -42,6 +48,11 @@ def stac_products(files: Sequence[Path]) -> Found:
             document = _document(path)
             if document is not None and document.get("type") == "Feature":
                 images += _images(path, document, root)
+            elif document is not None:
+                for href in _links(document):
+                    # Published catalogues name their items by addresses; those beside them are found all the same.
+                    if "://" not in str(href):
+                        _named(path, href, root)
     return Found(tuple(images))
 
 
@@ -67,11 +78,15 @@ def stac_input(path: Path) -> Found:
             continue
         if depth == MAX_DEPTH or len(known) > MAX_ITEMS:
             raise InputError(f"{path} leads to more catalogues than are followed. Give the item itself.")
-        links = document.get("links", [])
-        for link in links if isinstance(links, list) else []:
-            if isinstance(link, Mapping) and link.get("rel") in ("item", "child"):
-                todo.append((_named(at, link.get("href"), path.parent), depth + 1))
+        todo += [(_named(at, href, path.parent), depth + 1) for href in _links(document)]
     return Found(tuple(sorted(images, key=lambda image: image.product)))
+
+
+def _links(document: Mapping[str, Any]) -> list[object]:
+    """What a catalogue or collection leads to."""
+    links = document.get("links", [])
+    known = [link for link in links if isinstance(link, Mapping)] if isinstance(links, list) else []
+    return [link.get("href") for link in known if link.get("rel") in ("item", "child")]
 
 
 def _document(path: Path) -> dict[str, Any] | None:

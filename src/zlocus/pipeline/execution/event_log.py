@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-NAME = "events.jsonl"
+from zlocus.core.requests import EVENTS
+
 MIN_WITHOUT_DECIMALS = 1e5
 LOGGER = logging.getLogger(__name__)
 
@@ -18,7 +19,7 @@ LOGGER = logging.getLogger(__name__)
 class EventLog:
     """Appends events to a file in a folder. A line that cannot be written is skipped, because the log only informs."""
 
-    def __init__(self, folder: Path, name: str = NAME) -> None:
+    def __init__(self, folder: Path, name: str = EVENTS) -> None:
         self.path = folder / name
 
     def remove(self) -> None:
