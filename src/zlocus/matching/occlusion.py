@@ -67,18 +67,21 @@ def exclude_views_of_one_direction(visible: VisibleHeights, tile_views: TileView
     """
     n_views = len(visible.lowest_covered)
     middle = np.array([cells_per_step(tile_views, view) for view in range(n_views)]) * steps_per_cell
-    apart = np.hypot(*np.moveaxis(middle[:, None] - middle[None], -1, 0))[np.triu_indices(n_views, 1)]
     # Directions turn a little within a tile.
-    if not (apart < 2 * MIN_BASE_TO_HEIGHT).any():
+    is_near = np.hypot(*np.moveaxis(middle[:, None] - middle[None], -1, 0)) < 2 * MIN_BASE_TO_HEIGHT
+    most_alike = int(is_near.sum(axis=1).max(initial=0))
+    if most_alike < PAIR:
         return
-    covered, shape = covers(visible), visible.lowest_covered.shape[1:]
-    low, high = np.full((2, *shape), np.inf, np.float32), np.full((2, *shape), -np.inf, np.float32)
-    for view, by_block in enumerate(directions_of_blocks(tile_views) * steps_per_cell):
-        direction = _cells_of(np.moveaxis(by_block, -1, 0).astype(np.float32), tile_views.block, shape)
-        np.minimum(low, direction, out=low, where=covered[view])
-        np.maximum(high, direction, out=high, where=covered[view])
-    is_alike = (covered.sum(axis=0) >= PAIR) & (np.hypot(*np.subtract(high, low)) < MIN_BASE_TO_HEIGHT)
-    exclude(visible, covered & is_alike)
+    covered = covers(visible)
+    count = covered.sum(axis=0)
+    row, col = np.nonzero((count >= PAIR) & (count <= most_alike))
+    direction = directions_of_blocks(tile_views)[:, row // tile_views.block, col // tile_views.block] * steps_per_cell
+    is_covering = covered[:, row, col, None]
+    low, high = (np.where(is_covering, direction, beyond) for beyond in (np.inf, -np.inf))
+    is_alike = np.hypot(*(high.max(axis=0) - low.min(axis=0)).T) < MIN_BASE_TO_HEIGHT
+    excluded = np.zeros_like(covered)
+    excluded[:, row[is_alike], col[is_alike]] = True
+    exclude(visible, excluded)
 
 
 def excluded_view_mask(tile_views: TileViews, shape: tuple[int, int]) -> NDArray[np.bool_]:
