@@ -33,7 +33,7 @@ from zlocus.synthetic.painted_clouds import with_clouds
 
 # The cloud is over the first image, which looks most nearly straight down and shows most of the ground.
 CLOUDED, CLEAR_VIEWS = "n1", ("f1", "b1", "n2")
-CLOUD_SHARE, PIXEL_M, N_TOWNS, TOWN_CELLS = 0.3, 0.5, 5, 400
+CLOUD_SHARE, PIXEL_M, TOWN_CELLS = 0.3, 0.5, 400
 # From this share on a pixel shows the cloud more than the ground.
 MOSTLY_CLOUD = 0.5
 THRESHOLDS_M, OFF_M = (1.0, 0.5), 10.0
@@ -46,7 +46,7 @@ MAX_MORE_OFF = 0.01
 
 def clouds(workplace: Workplace) -> list[Figure]:
     """Rendered towns by their mean, and the two shared realistic scenes."""
-    seeds = fresh_seeds(N_TOWNS)
+    seeds = fresh_seeds()
     workplace.inputs["seeds"] = seeds
     figures = over_seeds(seeds, lambda seed: _on_town(workplace.out, seed), ("within", "with a height"))
     for number, name in enumerate(SHARED):
