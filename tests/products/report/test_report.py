@@ -336,7 +336,7 @@ def test_the_comparison_is_that_of_evaluate(out, tmp_path):
     for row in table.rows:
         assert " ".join(" ".join(cell for part in row for cell in part).split()) in text
     assert "Within: share of all cells in error by less than 0.5 m; errors in m." in text
-    assert "MVS3DM (single cells), absolute: completeness" in text
+    assert "MVS3DM, absolute: completeness" in text
     assert "<b>truth.tif" in text
     summary = page_of(out).text("summary")
     assert f"As the surface lies (absolute), {100 * figures.within:.1f} % have one with an error below 0.5 m" in summary
