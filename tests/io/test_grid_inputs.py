@@ -237,3 +237,17 @@ def test_vector_files_without_an_area_are_refused(tmp_path):
 def test_grid_crs_is_kept_as_its_code(tmp_path):
     write_cog(tmp_path / "a.tif", np.zeros(GRID.shape, np.float32), GRID)
     assert CRS.from_user_input(read_geobox(tmp_path / "a.tif").crs) == CRS.from_epsg(32631)
+
+
+def test_coordinates_in_metres_without_a_crs_are_no_longitudes_and_latitudes(tmp_path):
+    """GeoJSON without a CRS is in degrees."""
+    path = tmp_path / "utm.geojson"
+    path.write_text(shapely.to_geojson(shapely.box(461984.5, 5246991.0, 462014.5, 5247011.0)))
+    with pytest.raises(InputError, match=r"utm\.geojson has polygons at .*, which are no longitudes and latitudes"):
+        read_polygons(path, grid_crs(GRID))
+
+
+def test_coordinates_beyond_their_crs_are_refused(tmp_path):
+    far = write_polygons(tmp_path / "far.gpkg", shapely.box(1e8, 1e8, 2e8, 2e8), crs="EPSG:32632", driver="GPKG")
+    with pytest.raises(InputError, match=r"far\.gpkg has polygons from 1e\+08.*, which WGS 84 / UTM zone 32N does not"):
+        read_polygons(far, grid_crs(GRID))

@@ -22,7 +22,7 @@ from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.crs import checked_crs, file_crs, raster_crs
 from zlocus.io.height_values import check_unit, is_fill
 from zlocus.io.open_raster import open_raster
-from zlocus.io.vector_files import read_vector
+from zlocus.io.vector_files import check_degrees, read_vector
 from zlocus.io.vertical import (
     ELLIPSOIDAL_DESCRIPTION,
     VerticalDatum,
@@ -158,7 +158,8 @@ def _converted(polygons: NDArray[Any], path: Path, own_crs: CRS, crs: CRS) -> ND
     Raises
     ------
     InputError
-        A coordinate is not finite, or the polygons have no area.
+        A coordinate is not finite, is no longitude or latitude in a geographic CRS, or cannot be converted; or the
+        polygons have no area.
     """
     with np.errstate(invalid="ignore"):  # coordinates that are not finite are refused below
         west, south, east, north = shapely.total_bounds(polygons)
@@ -167,9 +168,16 @@ def _converted(polygons: NDArray[Any], path: Path, own_crs: CRS, crs: CRS) -> ND
         raise InputError(
             f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, or without an end, which is no area."
         )
+    check_degrees(polygons, own_crs, path)
     polygons = shapely.segmentize(polygons, largest / MIN_PIECES_PER_EXTENT)
     transformer = Transformer.from_crs(own_crs.to_2d(), crs.to_2d(), always_xy=True)
-    return np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
+    converted = np.asarray(shapely.transform(polygons, lambda xy: np.column_stack(transformer.transform(*xy.T))))
+    if not np.isfinite(shapely.get_coordinates(converted)).all():
+        raise InputError(
+            f"{path} has polygons from {west:g}, {south:g} to {east:g}, {north:g}, which {own_crs.name} does not "
+            "reach. Check its CRS."
+        )
+    return converted
 
 
 def cells_inside(polygons: NDArray[Any], geobox: GeoBox) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,15 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from zlocus.core.errors import InputError
 from zlocus.io.open_raster import existing_file
 from zlocus.io.stored_files import first_bytes, is_remote
 from zlocus.io.virtual_rasters import ARCHIVES
 
+# Largest longitude and latitude, degrees: some files count longitudes to 360.
+MAX_LONGITUDE, MAX_LATITUDE = 360.0, 90.0
 MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
 # Vector formats that hold their polygons in the file itself.
 VECTOR_DRIVERS = (
@@ -85,6 +89,29 @@ def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None
     if is_empty or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     return VectorPolygons(polygons, meta["crs"], numbers, None if field is None else np.asarray(columns[0])[is_there])
+
+
+def check_degrees(polygons: NDArray[np.object_], crs: CRS, path: Path) -> None:
+    """Refuse polygons of a geographic CRS whose coordinates are no longitudes and latitudes.
+
+    polygons : (n,), x before y; path : of their file, for messages. GeoJSON without a CRS counts as geographic.
+
+    Raises
+    ------
+    InputError
+        A coordinate is larger than any longitude or latitude.
+    """
+    if not crs.is_geographic or not len(polygons):
+        return
+    degrees_per_unit = math.degrees(crs.axis_info[0].unit_conversion_factor)
+    x, y = np.abs(shapely.get_coordinates(polygons)).max(axis=0) * degrees_per_unit
+    if x > MAX_LONGITUDE or y > MAX_LATITUDE:
+        first_x, first_y = shapely.get_coordinates(polygons)[0]
+        raise InputError(
+            f"{path} has polygons at {first_x:.8g}, {first_y:.8g}, which are no longitudes and latitudes, and its CRS "
+            f"is geographic ({crs.name}). GeoJSON without a CRS means WGS 84. Name the CRS of the coordinates in the "
+            "file, or convert them."
+        )
 
 
 def _check_field(path: Path, field: str | None, known: list[str]) -> None:

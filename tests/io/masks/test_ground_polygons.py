@@ -80,3 +80,9 @@ def test_lines_are_no_mask(tmp_path):
     path.write_text(path.read_text().replace('"Polygon"', '"MultiLineString"'))
     with pytest.raises(InputError, match="features, not polygons"):
         mask_of(SHAPE, {"file": str(path)}, rpc=RPC)
+
+
+def test_polygons_in_metres_without_a_crs_are_refused(tmp_path):
+    path = geojson(tmp_path / "utm.geojson", [box(461984.5, 5246991.0, 462014.5, 5247011.0)])
+    with pytest.raises(InputError, match=r"The mask of the view a: .*utm\.geojson has .*no longitudes and latitudes"):
+        mask_of(SHAPE, {"file": str(path)}, rpc=RPC, mean_height=450.0)

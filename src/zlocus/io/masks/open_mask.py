@@ -20,7 +20,7 @@ from zlocus.io.masks.raster_mask import open_raster_mask
 from zlocus.io.open_raster import existing_file
 from zlocus.io.safe_documents import read_xml
 from zlocus.io.stored_files import file_exists
-from zlocus.io.vector_files import read_vector
+from zlocus.io.vector_files import check_degrees, read_vector
 
 VECTOR_SUFFIXES = (
     ".fgb", ".geojson", ".geojsonl", ".gml", ".gpkg", ".json", ".kml", ".shp", ".sqlite", ".topojson",
@@ -91,7 +91,9 @@ def _polygons_of(entry: MaskEntry, path: Path) -> tuple[MaskPolygons, bool]:
         return MaskPolygons(_counted_from_centre(read.polygons, entry.coordinates == "pixel_corners"), None), False
     if read.crs is None:
         raise InputError(f"{path} has no CRS, so its polygons are in pixels. Leave `coordinates: ground` out.")
-    return MaskPolygons(read.polygons, file_crs(read.crs, path)), False
+    crs = file_crs(read.crs, path)
+    check_degrees(read.polygons, crs, path)
+    return MaskPolygons(read.polygons, crs), False
 
 
 def _counted_from_centre(polygons: NDArray[np.object_], from_corner: bool) -> NDArray[np.object_]:
