@@ -224,8 +224,8 @@ def test_vector_files_without_an_area_are_refused(tmp_path):
         nowhere = write_polygons(tmp_path / "n.shp", shapely.box(0, 0, 1, 1), crs=None, driver="ESRI Shapefile")
     for path, message in (
         (tmp_path / "none.gpkg", "There is no vector file"),
-        (tmp_path / "notes.geojson", r"notes\.geojson cannot be read as vector file"),
-        (tmp_path / "empty.geojson", "not polygons"),
+        (tmp_path / "notes.geojson", r"its format is not known\. Give GeoJSON, GeoPackage or Shapefile\.$"),
+        (tmp_path / "empty.geojson", r"empty\.geojson holds no polygons\. Give a file with polygons\.$"),
         (points, "holds Point features, not polygons"),
         (two, r"has 2 layers \(fields, roads\)"),
         (nowhere, r"n\.shp has no CRS"),

@@ -158,7 +158,7 @@ def test_a_dry_run_tells_the_polygons(zl, images, water, tmp_path):
     done = zl(*words[words.index("dsm") :])
     assert done.exit_code == 0, done.output
     assert f"Water: 2 polygons of {water} will be levelled." in done.stdout
-    assert f"Outside the grid, and without effect, lies of {water}: polygon 3." in done.stderr
+    assert f"Polygon 3 of {water} lies outside the grid and has no effect." in done.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -21,6 +21,8 @@ from zlocus.io.virtual_rasters import ARCHIVES
 # Largest longitude and latitude, degrees: some files count longitudes to 360.
 MAX_LONGITUDE, MAX_LATITUDE = 360.0, 90.0
 MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
+# What GDAL says, before advice about its drivers, of a file that is none of its formats.
+UNKNOWN_FORMAT = "not recognized as being in a supported file format"
 # Vector formats that hold their polygons in the file itself.
 VECTOR_DRIVERS = (
     "ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
@@ -75,20 +77,26 @@ def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None
             meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=True)
             polygons = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
-        why = (
-            "some text in it is not UTF-8"
-            if isinstance(error, UnicodeError)
-            else " ".join(str(error).split())[:MAX_REASON_CHARACTERS]
-        )
         raise InputError(
-            f"{path} cannot be read as vector file: {why.rstrip('.')}. Give GeoJSON, GeoPackage or Shapefile."
+            f"{path} cannot be read as vector file: {_reason_of(error)}. Give GeoJSON, GeoPackage or Shapefile."
         ) from error
     is_there = ~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)
     polygons, numbers = polygons[is_there], np.flatnonzero(is_there) + 1
-    is_empty = not len(polygons) and not may_be_empty
-    if is_empty or not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
+    if not len(polygons) and not may_be_empty:
+        raise InputError(f"{path} holds no polygons. Give a file with polygons.")
+    if not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
         raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
     return VectorPolygons(polygons, meta["crs"], numbers, None if field is None else np.asarray(columns[0])[is_there])
+
+
+def _reason_of(error: Exception) -> str:
+    """Why a file cannot be read, without a full stop and without advice for users of GDAL."""
+    if isinstance(error, UnicodeError):
+        return "some text in it is not UTF-8"
+    text = " ".join(str(error).split())
+    if UNKNOWN_FORMAT in text:
+        return "its format is not known"
+    return text[:MAX_REASON_CHARACTERS].rstrip(".")
 
 
 def check_degrees(polygons: NDArray[np.object_], crs: CRS, path: Path) -> None:

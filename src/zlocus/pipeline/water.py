@@ -35,7 +35,8 @@ def water_on_grid(water_polygons: WaterPolygons, geobox: GeoBox, progress: Progr
             f"{ymin:.0f} to {ymax:.0f} m). Check the polygons and their CRS."
         )
     if beside:
-        progress.note(f"Outside the grid, and without effect, lies of {water_polygons.path}: {_named(beside)}.")
+        lies = "lies outside the grid and has" if len(beside) == 1 else "lie outside the grid and have"
+        progress.note(f"{_named(beside).capitalize()} of {water_polygons.path} {lies} no effect.")
     return water_polygons.only(np.isin(water_polygons.names, beside, invert=True))
 
 

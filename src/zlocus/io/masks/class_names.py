@@ -59,7 +59,7 @@ def values_of(wanted: Sequence[int | str], names: Mapping[str, int], path: Path)
         else:
             shown = ", ".join(list(names)[:MAX_SHOWN_NAMES])
             has = f"It has {shown}" if names else "It names none; give `names: {name: value}`, or numbers"
-            raise InputError(f"The mask {path} has no class called {quoted(value)}. {has}.")
+            raise InputError(f"{path} has no class called {quoted(value)}. {has}.")
     return tuple(sorted(found))
 
 

@@ -104,7 +104,7 @@ def _of_types(features: Sequence[Element], classes: Sequence[str], path: Path) -
     wanted = {words_of(name) for name in classes}
     if types and not wanted <= types.keys():
         (missing, *_) = (name for name in classes if words_of(name) not in types)
-        raise InputError(f"The mask {path} has no class called {quoted(missing)}. It has {', '.join(types.values())}.")
+        raise InputError(f"{path} has no class called {quoted(missing)}. It has {', '.join(types.values())}.")
     return [each for each in features if any(words_of(text) in wanted for text in _types(each))]
 
 

@@ -90,4 +90,4 @@ def _refuse(entry: MaskEntry, path: Path, kind: str) -> None:
 
 def _check_name(name: int | str, known: Sequence[str], path: Path) -> None:
     if words_of(str(name)) not in {words_of(each) for each in known}:
-        raise InputError(f"The mask {path} has no class called {quoted(str(name))}. It has {', '.join(known)}.")
+        raise InputError(f"{path} has no class called {quoted(str(name))}. It has {', '.join(known)}.")

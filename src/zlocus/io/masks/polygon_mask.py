@@ -63,12 +63,12 @@ class PolygonMask:
         n_points = int(shapely.get_num_coordinates(parts).sum()) if len(parts) else 0
         if n_points > MAX_POINTS:
             raise InputError(
-                f"The mask {path} has {n_points} points, more than the {MAX_POINTS} that are read. Simplify its "
+                f"{path} has {n_points} points, more than the {MAX_POINTS} that are read. Simplify its "
                 "polygons, or give a raster."
             )
         parts = parts[~shapely.is_empty(parts)] if len(parts) else parts
         if not np.isfinite(shapely.get_coordinates(parts)).all():
-            raise InputError(f"The mask {path} has polygons with coordinates that are not finite. Mend the file.")
+            raise InputError(f"{path} has polygons with coordinates that are not finite. Mend the file.")
         with_area = np.array(parts, object)
         digest = hashlib.sha256(repr((str(path), shape)).encode())
         for wkb in shapely.to_wkb(with_area):

@@ -91,7 +91,7 @@ def _check_extent(source: rasterio.DatasetReader, path: Path, image: Path, shape
     size = f"{source.height} x {source.width} px, and {image} {shape[0]} x {shape[1]} px"
     if source.crs is not None:
         raise InputError(
-            f"The mask {path} has {size}, and a CRS: it is on the ground, where rasters are not read as masks. Give "
+            f"{path} has {size}, and a CRS: it is on the ground, where rasters are not read as masks. Give "
             "one in the pixels of the image, or polygons."
         )
     smaller = all(m <= n for m, n in zip(source.shape, shape, strict=True))
@@ -100,7 +100,7 @@ def _check_extent(source: rasterio.DatasetReader, path: Path, image: Path, shape
     high = min(n / max(m - 1, 0.5) for m, n in zip(source.shape, shape, strict=True))
     if not smaller or low >= high:
         raise InputError(
-            f"The mask {path} has {size}: it does not cover the same extent with as many or fewer pixels. Check that "
+            f"{path} has {size}: it does not cover the same extent with as many or fewer pixels. Check that "
             "it belongs to this image."
         )
 
@@ -131,7 +131,7 @@ def _band(given: int | str | None, source: rasterio.DatasetReader, path: Path) -
         return 1
     if isinstance(given, int):
         if not 1 <= given <= source.count:
-            raise InputError(f"The mask {path} has {source.count} bands, not a band {given}. Correct `band`.")
+            raise InputError(f"{path} has {source.count} bands, not a band {given}. Correct `band`.")
         return given
     return band_named(given, source.descriptions, path)
 
@@ -147,5 +147,5 @@ def band_named(name: str, descriptions: Sequence[str | None], path: Path) -> int
     found = [i for i, text in enumerate(descriptions, 1) if text and words_of(text) == words_of(name)]
     if len(found) != 1:
         has = ", ".join(text for text in descriptions if text) or "bands without names"
-        raise InputError(f"The mask {path} has {len(found) or 'no'} bands called {quoted(name)}: it has {has}.")
+        raise InputError(f"{path} has {len(found) or 'no'} bands called {quoted(name)}: it has {has}.")
     return found[0]
