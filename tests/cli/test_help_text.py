@@ -121,3 +121,9 @@ def test_shells_complete_commands_and_options():
     assert "--products" in completed("bash", "zlocus dsm --pro", 2)
     assert "doctor" in completed("zsh", "zlocus do", 1)
     assert "doctor" in completed("fish", "zlocus do", 1)
+
+
+@pytest.mark.parametrize("name", ["dsm", "doctor", "tiles plan"])
+def test_the_help_names_every_kind_of_input(name):
+    text = " ".join(CliRunner().invoke(app, [*name.split(), "--help"]).stdout.replace("│", " ").split())
+    assert "Images with RPC, folders or archives of deliveries, or one scene.yaml." in text

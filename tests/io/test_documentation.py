@@ -21,6 +21,15 @@ def test_a_page_is_found_by_its_path_or_its_last_part():
     assert "<!--" not in page("quality").text
 
 
+def test_comments_at_the_ends_of_lines_take_nothing_else_with_them():
+    """Figures stand between comments, which make their lines longer or shorter than what is read."""
+    text = page("water").text
+    assert "are 100 % and 100 % water, and" in text
+    paragraph = next(each for each in text.split("\n\n") if "100 % and 100 %" in each)
+    assert all(80 < len(line) <= 120 for line in paragraph.splitlines()[:-1])
+    assert "cells of 0.5 m:\n\n| lake | two views" in text
+
+
 @pytest.mark.parametrize(
     ("name", "says"), [("nothing", "`zlocus docs` lists all pages"), ("qual", "Near to it: reference/quality")]
 )

@@ -11,7 +11,7 @@ import typer
 from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
 from zlocus.cli.console import Console
-from zlocus.cli.shared_options import ConfigFile, Crs, Overwrite, Resolution, Settings, TieHeights
+from zlocus.cli.shared_options import INPUTS, ConfigFile, Crs, Overwrite, Resolution, Settings, TieHeights
 from zlocus.core.paper_request import PaperRequest
 from zlocus.core.requests import check_output
 
@@ -24,7 +24,7 @@ class PaperOptions:
     inputs: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Images with RPC, or one scene.yaml. Default: the demo's block, rendered into OUT/scene.",
+            help=f"{INPUTS} Default: the demo's block, rendered into OUT/scene.",
             metavar="INPUT",
         ),
     ] = None

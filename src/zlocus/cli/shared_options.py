@@ -11,7 +11,8 @@ import typer
 AREA_AND_GRID, HEIGHTS, MATCHING, RUN, RESULT = "Area and grid", "Heights", "Matching", "Run", "Result"
 VERTICAL_DATUMS = "ellipsoid|egm96|egm2008|FILE"
 
-Inputs = Annotated[list[Path], typer.Argument(help="Images with RPC, or one scene.yaml.", metavar="INPUT")]
+INPUTS = "Images with RPC, folders or archives of deliveries, or one scene.yaml."
+Inputs = Annotated[list[Path], typer.Argument(help=INPUTS, metavar="INPUT")]
 ResultFolder = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.", rich_help_panel=RESULT)]
 Resolution = Annotated[
     float | None,

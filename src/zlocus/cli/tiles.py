@@ -13,7 +13,7 @@ from zlocus.cli.commands import Command, command_of, config_of
 from zlocus.cli.console import Console
 from zlocus.cli.dsm import DsmOptions, dsm_request
 from zlocus.cli.help_text import EXAMPLES, GroupedHelp, short_help
-from zlocus.cli.shared_options import Partial
+from zlocus.cli.shared_options import INPUTS, Partial
 from zlocus.core.errors import ConfigError
 
 OUT_HELP = "Folder for the result, which all processes see."
@@ -32,9 +32,7 @@ tiles = typer.Typer(
 def _plan_options() -> type[Any]:
     """The options of `zlocus tiles plan`: those of `zlocus dsm` for the surface, and the number of tasks."""
     hints = get_type_hints(DsmOptions, include_extras=True)
-    inputs = typer.Argument(
-        help="Images with RPC, or one scene.yaml. None: say what is done of the plan in OUT.", metavar="INPUT"
-    )
+    inputs = typer.Argument(help=f"{INPUTS} None: say what is done of the plan in OUT.", metavar="INPUT")
     tasks = typer.Option(help="Tasks to deal the tiles into. Default: one for each tile.", metavar="K")
     own: list[Any] = [
         ("out", OutArgument),

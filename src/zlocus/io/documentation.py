@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
 from zlocus.core.errors import InputError
 from zlocus.core.quoting import quoted
 
-# Comments mark figures that are written from measurements, and say nothing to a reader.
-COMMENT = re.compile(r"<!--.*?-->\n?", re.DOTALL)
+# Comments mark figures that are written from measurements, and say nothing to a reader: whole lines, or inside a text.
+COMMENT_LINES = re.compile(r"^<!--(?:(?!-->).)*-->\n\n?", re.DOTALL | re.MULTILINE)
+COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+LINE_CHARACTERS = 120
+# A paragraph with a line that begins like this is no running text: its lines stay as they are.
+NO_TEXT = re.compile(r"^(\||#|- |```|    |>|\d+\. )", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,18 @@ class Page:
 
     @property
     def text(self) -> str:
-        """The page as Markdown, without comments."""
-        return COMMENT.sub("", self.path.read_text(encoding="utf-8"))
+        """The page as Markdown, without comments; paragraphs that had some are filled again."""
+        whole = COMMENT_LINES.sub("", self.path.read_text(encoding="utf-8"))
+        return "\n\n".join(_without_comments(paragraph) for paragraph in whole.split("\n\n"))
+
+
+def _without_comments(paragraph: str) -> str:
+    """A paragraph without comments, in lines of usual length where it had some."""
+    text = COMMENT.sub("", paragraph)
+    if text == paragraph or NO_TEXT.search(text):
+        return text
+    end = "\n" if text.endswith("\n") else ""
+    return textwrap.fill(text, LINE_CHARACTERS, break_long_words=False, break_on_hyphens=False) + end
 
 
 def pages() -> list[Page]:
