@@ -115,6 +115,7 @@ def dimap_delivery(root: Path, taken: list[Shot], tile: tuple[int, int] | None =
             left, top, right, bottom = (edge + 0.5 for edge in CLOUDED)
             gml(folder / "MASKS" / f"CLD_{name}_MSK.GML", box(left, top, right, bottom))
             gml(folder / "MASKS" / f"SNW_{name}_MSK.GML", box(1, 1, 30, 30), kind="SNOW", title="Snow mask")
+            gml(folder / "MASKS" / f"QTE_{name}_MSK.GML", kind="QUALITY", title="Quality mask")
     return root
 
 

@@ -13,7 +13,7 @@ from zlocus.io.archives import is_archived, member_of
 from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.colour_image import ColourImage
-from zlocus.io.deliveries.delivery import DeliveredView, describe, is_delivery, open_delivery
+from zlocus.io.deliveries.delivery import MAX_NAMED, DeliveredView, Delivery, describe, is_delivery, open_delivery
 from zlocus.io.masks.mask_entry import MaskEntry
 from zlocus.io.masks.vendor_masks import vendor_kind, vendor_mask
 
@@ -51,6 +51,7 @@ def entries_of(paths: Sequence[Path]) -> tuple[ResolvedEntry, ...]:
     for delivery in delivered.values():
         if delivery.set_aside:
             warnings.warn(describe(delivery), ZlocusWarning, stacklevel=2)
+        _warn_of_missing_masks(delivery)
         entries += [_entry(view) for view in delivery.views]
     _warn_of_slow(entries)
     return tuple(_with_own_names(entries))
@@ -72,6 +73,21 @@ def _mask_entry(path: Path) -> MaskEntry | None:
     """The entry of a vendor's mask; None of one that is not applied, or of a kind that is not known."""
     kind = vendor_kind(path) or ("classes" if path.suffix.lower() in (".tif", ".tiff") else None)
     return None if kind is None else vendor_mask(path, kind)
+
+
+def _warn_of_missing_masks(delivery: Delivery) -> None:
+    """Say which masks of the matched images are missing, of those that are applied."""
+    missing = [path.name for view in delivery.views for path in view.image.missing_masks if _mask_entry(path)]
+    if not missing:
+        return
+    masks = "a mask that belongs" if len(missing) == 1 else f"{len(missing)} masks that belong"
+    more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
+    warnings.warn(
+        f"{delivery.path} lacks {masks} to its images: {', '.join(missing[:MAX_NAMED])}{more}. Clouds and defects "
+        "there will be matched. Copy what is missing from the delivery, or give masks in a scene.yaml.",
+        ZlocusWarning,
+        stacklevel=3,
+    )
 
 
 def _warn_of_slow(entries: Sequence[ResolvedEntry]) -> None:

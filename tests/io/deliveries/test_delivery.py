@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import re
 import shutil
 import tarfile
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +32,7 @@ from rpc_fixtures import write_image
 from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.scene import SunDirection
 from zlocus.io.deliveries.delivery import describe, is_delivery, open_delivery
+from zlocus.io.resolved_entry import entries_of
 from zlocus.io.scene_file import open_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -134,6 +137,41 @@ def test_masks_of_clouds_are_obeyed_and_those_of_snow_are_not(made, taken, vendo
         has_mask = vendor.startswith(("dimap", "planet"))
         assert np.array_equal(valid, ~shot.is_cloudy if has_mask else np.ones_like(valid))
         assert bool([path for path in view.files if "MSK" in path.name or "udm" in path.name]) == has_mask
+
+
+@pytest.mark.parametrize(
+    ("vendor", "which", "said"),
+    [
+        (
+            "dimap",
+            "CLD_*_P_*-001_MSK.GML",
+            r"delivery lacks 2 masks that belong to its images: CLD_PHR1A_P_.*GML, CLD_",
+        ),
+        (
+            "dimap",
+            "QTE_*_P_*nadir-001_MSK.GML",
+            r"lacks a mask that belongs to its images: QTE_PHR1A_P_.*nadir.*\.GML\.",
+        ),
+        ("dimap", "SNW_*.GML", None),
+        ("dimap", "CLD_*_MS_*.GML", None),
+        (
+            "planet",
+            "*nadir*panchromatic_udm2.tif",
+            r"lacks a mask that .*: .*nadir_basic_panchromatic_udm2\.tif\. Clouds",
+        ),
+        ("planet", "*udm2.tif", None),
+    ],
+)
+def test_masks_that_are_obeyed_and_missing_are_named(made, tmp_path, vendor, which, said):
+    delivery = shutil.copytree(made(vendor), tmp_path / "delivery")
+    for path in delivery.rglob(which):
+        path.unlink()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ZlocusWarning)
+        entries_of([delivery])
+    sentences = [str(each.message) for each in caught]
+    assert len(sentences) == (said is not None)
+    assert all(re.search(said, sentence) for sentence in sentences)
 
 
 def test_nitf_files_of_a_folder(taken, tmp_path):

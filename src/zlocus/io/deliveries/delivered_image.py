@@ -25,8 +25,8 @@ class DeliveredImage:
     product : name of the product, unique in the delivery; pixels : the file of pixels, or the index of its tiles;
     camera : file of its camera, None where the camera is in the file of pixels; colour_bands : numbers of its red,
     green and blue band, from 1, None where it is not known to have them; shape : rows and columns that the vendor's
-    files say, None where they do not; masks : files of masks that belong to it; claimed : all files that belong to it,
-    so that they are not taken for other images.
+    files say, None where they do not; masks : files of masks that belong to it; missing_masks : files of masks that
+    should be there and are not; claimed : all files that belong to it, so that they are not taken for other images.
     """
 
     product: str
@@ -37,6 +37,7 @@ class DeliveredImage:
     colour_bands: tuple[int, int, int] | None = None
     shape: tuple[int, int] | None = None
     masks: tuple[Path, ...] = ()
+    missing_masks: tuple[Path, ...] = ()
     claimed: frozenset[Path] = field(default=frozenset(), compare=False, repr=False)
 
 

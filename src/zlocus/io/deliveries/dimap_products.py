@@ -70,6 +70,7 @@ def dimap_image(path: Path, root: Element) -> DeliveredImage:
         colour_bands=_colour_bands(root),
         shape=(whole_number(dimensions[0], "NROWS", path), whole_number(dimensions[1], "NCOLS", path)),
         masks=tuple(mask for mask in masks if file_exists(mask)),
+        missing_masks=tuple(mask for mask in masks if not file_exists(mask)),
         claimed=frozenset((path, *tiles, *others)),
     )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from zlocus.core.scene import NOT_KNOWN, Acquisition
@@ -44,7 +45,24 @@ def planet_products(files: Sequence[Path]) -> Found:
             aside.append(SetAside(path, "is an earlier level of the panchromatic image beside it"))
         else:
             images.append(_image(path, match, beside))
-    return Found(tuple(images), tuple(aside))
+    return Found(tuple(_with_missing_masks(images)), tuple(aside))
+
+
+def _with_missing_masks(images: Sequence[DeliveredImage]) -> list[DeliveredImage]:
+    """The images, of which those without a mask miss one where another image of their kind has it: nothing names the
+    masks of a scene."""
+    masked = {image.spectrum for image in images if image.masks}
+    return [
+        image
+        if image.masks or image.spectrum not in masked
+        else replace(image, missing_masks=(image.pixels.with_name(_mask_name(image.pixels)),))
+        for image in images
+    ]
+
+
+def _mask_name(pixels: Path) -> str:
+    """The usual name of the mask of an image: the number (dn) of the image is not in it."""
+    return f"{re.sub('_dn$', '', pixels.stem, flags=re.IGNORECASE)}_udm2.tif"
 
 
 def _is_final(other: re.Match[str], scene: str) -> bool:
