@@ -36,6 +36,7 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.io.cameras.camera_entry import CameraEntry, OpenedCamera, Vector
 from zlocus.io.cameras.camera_kinds import CAMERA_KINDS, RpcCamera, RpcSource
 from zlocus.io.cameras.frame_camera import FrameCamera
+from zlocus.io.cameras.shared_rpc import ImageRpc, shared_rpc_message, shared_rpcs
 from zlocus.io.colour_entry import ColourEntry
 from zlocus.io.crs import check_fits, checked_crs, local_frame, utm_zone
 from zlocus.io.images import (
@@ -163,8 +164,8 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[
     Raises
     ------
     InputError
-        A file is missing, damaged or given twice; an image is empty, constant or without a camera; there are fewer than
-        two images.
+        A file is missing, damaged or given twice; an image is empty, constant, without a camera or with that of another
+        one; there are fewer than two images.
     ConfigError
         The CRS is not projected in metres.
     """
@@ -173,6 +174,8 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[
     if len(opened) < 2:
         given = f"only {opened[0].entry.path} was given" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
+    for one, other in _with_shared_rpcs(opened):
+        raise InputError(shared_rpc_message(one.entry.path, other.entry.path))
     frame = _frame_of(opened, scene_input.crs)
     scene = scene_input.scene([each.view(frame) for each in opened], frame)
     scene = scene if chosen is None else chosen(scene)
@@ -220,6 +223,10 @@ def open_usable_views(inputs: Sequence[Path], crs: CRS | None = None) -> UsableV
         for entry in scene_input.entries
         for each in attempt(entry, partial(_open_checked_view, entry, scene_input.folder))
     ]
+    for pair in _with_shared_rpcs(opened):
+        reason = shared_rpc_message(*(each.entry.path for each in pair))
+        refused_by_name |= {each.entry.name: RefusedView(each.entry.name, each.entry.path, reason) for each in pair}
+    opened = [each for each in opened if each.entry.name not in refused_by_name]
     frame = scene_input.crs
     if frame is None:
         opened = [each for each in opened if attempt(each.entry, partial(_mean_centre, [each]))]
@@ -318,10 +325,22 @@ class _OpenedView:
         # The centre of an image whose middle is that of the stored part.
         return self.camera.centre((2 * top + rows, 2 * left + cols))
 
+    @property
+    def acquisition(self) -> Acquisition:
+        """What is known of the exposure."""
+        return self.entry.acquisition.completed_by(self.image.acquisition)
+
+    @property
+    def image_rpc(self) -> ImageRpc | None:
+        """The image with its RPC; None where the camera is another one."""
+        if not isinstance(self.camera, RpcSource):
+            return None
+        rpc = self.camera.rpc.moved(*(self.camera.shift or (0.0, 0.0)))
+        return ImageRpc(self.entry.path, self.image.shape, self.acquisition, rpc)
+
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
-        entry = self.entry
-        acquisition = entry.acquisition.completed_by(self.image.acquisition)
+        entry, acquisition = self.entry, self.acquisition
         sensor = self.camera.sensor(crs)
         image = self._masked_image(sensor, crs)
         return View(entry.name, entry.path, image, sensor, self.camera.files, acquisition)
@@ -460,6 +479,13 @@ def _check_distinct(paths: Sequence[Path]) -> None:
         if path.resolve() in known_paths:
             raise InputError(f"{path} is given twice. Each image counts once; remove one.")
         known_paths.add(path.resolve())
+
+
+def _with_shared_rpcs(opened: Sequence[_OpenedView]) -> list[tuple[_OpenedView, _OpenedView]]:
+    """The pairs of views that have the identical RPC, see `shared_rpcs`."""
+    by_path = {each.entry.path: each for each in opened}
+    shared = shared_rpcs(rpc for each in opened if (rpc := each.image_rpc) is not None)
+    return [(by_path[one.path], by_path[other.path]) for one, other in shared]
 
 
 def _camera(value: Any, path: Path, where: str) -> Any:

@@ -15,6 +15,7 @@ from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Reader, 
 from zlocus.io.deliveries.dimap_products import dimap_input, dimap_products
 from zlocus.io.deliveries.gaofen_products import gaofen_products
 from zlocus.io.deliveries.geoeye_products import geoeye_products
+from zlocus.io.deliveries.ground_agreement import contradictions
 from zlocus.io.deliveries.listing import files_in
 from zlocus.io.deliveries.maxar_products import maxar_input, maxar_products
 from zlocus.io.deliveries.pairing import ColourPartner, colour_partner
@@ -81,6 +82,8 @@ def open_delivery(path: Path) -> Delivery:
     images = _unique(found.images)
     partners = {image.product: partner for image in images if (partner := colour_partner(image, images))}
     colours = {partner.image.product for partner in partners.values()}
+    for sentence in contradictions(images, {*partners, *colours}):
+        raise InputError(sentence)
     matched = [image for image in images if image.product not in colours]
     names = _names(matched)
     views = [DeliveredView(names[image.product], image, partners.get(image.product)) for image in matched]

@@ -85,7 +85,9 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
     findings = Findings()
     with progress.stage("Opening images"), findings.warned():
         usable = open_usable_views(request.inputs, requested_crs(request.crs))
-    findings.entries += [Finding(STOPS, each.reason, (each.name,)) for each in usable.refused]
+    for reason in dict.fromkeys(each.reason for each in usable.refused):
+        about = tuple(each.name for each in usable.refused if each.reason == reason)
+        findings.entries.append(Finding(STOPS, reason, about))
     scene = usable.scene
     if scene is None:
         diagnosis = Diagnosis((), (), (), (), None, None, usable.refused, (), tuple(findings.entries))

@@ -1,0 +1,49 @@
+"""Images that have the RPC of another one: a file that was copied or named wrongly."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from zlocus.core.scene import Acquisition
+from zlocus.sensors.rpc import RpcCoefficients
+
+# Images that are at most so many seconds apart may be products of one exposure, which share their RPC.
+SAME_EXPOSURE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class ImageRpc:
+    """The RPC that an image has. shape : rows and columns of the image."""
+
+    path: Path
+    shape: tuple[int, int]
+    acquisition: Acquisition
+    rpc: RpcCoefficients
+
+
+def shared_rpcs(images: Iterable[ImageRpc]) -> list[tuple[ImageRpc, ImageRpc]]:
+    """The pairs of images that have the identical RPC, though they are of different exposures or sizes."""
+    by_rpc: dict[RpcCoefficients, list[ImageRpc]] = {}
+    for each in images:
+        by_rpc.setdefault(each.rpc, []).append(each)
+    pairs = [pair for alike in by_rpc.values() for pair in itertools.combinations(alike, 2)]
+    return [(one, other) for one, other in pairs if not _may_share(one, other)]
+
+
+def _may_share(one: ImageRpc, other: ImageRpc) -> bool:
+    """Whether both may be products of one exposure, such as a panchromatic and a pansharpened image."""
+    first, second = one.acquisition.time, other.acquisition.time
+    if one.shape != other.shape or first is None or second is None:
+        return False
+    return abs((first - second).total_seconds()) <= SAME_EXPOSURE_SECONDS
+
+
+def shared_rpc_message(one: Path, other: Path) -> str:
+    """The sentence on two images that have the identical RPC."""
+    return (
+        f"{one} and {other} have the identical RPC, which belongs to one of them at most: heights would be wrong. Copy "
+        "the RPC of both again from their source, or leave one image out."
+    )
