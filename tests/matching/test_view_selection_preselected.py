@@ -11,7 +11,7 @@ import pytest
 
 from rendered_scenes import CENTRE
 from zlocus.core.options import SelectionOptions
-from zlocus.core.scene import View
+from zlocus.core.scene import Acquisition, View
 from zlocus.matching.view_selection import IMAGES_OF_HALO, candidates_of_points, preselected
 from zlocus.sensors.frame import FrameModel
 from zlocus.synthetic.cameras import SatelliteCamera
@@ -28,7 +28,7 @@ class Blank:
 def view(name, along=0.0, day=None, east=0.0):
     sensor = SatelliteCamera((CENTRE[0] + east, CENTRE[1], Z), (60.0, 50.0), 0.5, along, 0.0)
     date = None if day is None else datetime.date(2026, 1, 1) + datetime.timedelta(days=day)
-    return View(name, Path(name), Blank(), sensor, (), date)
+    return View(name, Path(name), Blank(), sensor, (), Acquisition(date))
 
 
 def corners():

@@ -24,17 +24,20 @@ class ImageRpc:
     rpc: RpcCoefficients
 
 
-def shared_rpcs(images: Iterable[ImageRpc]) -> list[tuple[ImageRpc, ImageRpc]]:
-    """The pairs of images that have the identical RPC, though they are of different exposures or sizes."""
+def shared_rpcs(images: Iterable[ImageRpc], products: bool = False) -> list[tuple[ImageRpc, ImageRpc]]:
+    """The pairs of images that have the identical RPC.
+
+    products : whether some may be products of one exposure, such as a panchromatic and a pansharpened image; then only
+    those of different exposures or sizes are found.
+    """
     by_rpc: dict[RpcCoefficients, list[ImageRpc]] = {}
     for each in images:
         by_rpc.setdefault(each.rpc, []).append(each)
     pairs = [pair for alike in by_rpc.values() for pair in itertools.combinations(alike, 2)]
-    return [(one, other) for one, other in pairs if not _may_share(one, other)]
+    return [(one, other) for one, other in pairs if not (products and _are_of_one_exposure(one, other))]
 
 
-def _may_share(one: ImageRpc, other: ImageRpc) -> bool:
-    """Whether both may be products of one exposure, such as a panchromatic and a pansharpened image."""
+def _are_of_one_exposure(one: ImageRpc, other: ImageRpc) -> bool:
     first, second = one.acquisition.time, other.acquisition.time
     if one.shape != other.shape or first is None or second is None:
         return False
@@ -44,6 +47,6 @@ def _may_share(one: ImageRpc, other: ImageRpc) -> bool:
 def shared_rpc_message(one: Path, other: Path) -> str:
     """The sentence on two images that have the identical RPC."""
     return (
-        f"{one} and {other} have the identical RPC, which belongs to one of them at most: heights would be wrong. Copy "
-        "the RPC of both again from their source, or leave one image out."
+        f"{one} and {other} have the identical RPC: one is a copy of the other, or has the RPC of the other. Leave one "
+        "image out, or copy the RPC of both again from their source."
     )

@@ -31,7 +31,7 @@ def contradictions(images: Sequence[DeliveredImage], paired: Collection[str]) ->
     paired : products of the panchromatic images that have colours, and of the images that give them.
     """
     known = {image.product: rpc for image in images if (rpc := _image_rpc(image)) is not None}
-    for one, other in shared_rpcs(known.values()):
+    for one, other in shared_rpcs(known.values(), products=True):
         yield shared_rpc_message(one.path, other.path)
     left = [image for image in images if image.product not in paired and image.product in known]
     for pan in (image for image in left if image.spectrum is Spectrum.PANCHROMATIC):
