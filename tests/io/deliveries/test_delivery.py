@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import datetime
 import re
 import shutil
 import tarfile
@@ -30,7 +31,7 @@ from made_up_deliveries import (
 )
 from rpc_fixtures import write_image
 from zlocus.core.errors import InputError, ZlocusWarning
-from zlocus.core.scene import SunDirection
+from zlocus.core.scene import Acquisition, SunDirection
 from zlocus.io.deliveries.delivery import describe, is_delivery, open_delivery
 from zlocus.io.resolved_entry import entries_of
 from zlocus.io.scene_file import open_scene
@@ -219,6 +220,24 @@ def test_a_table_of_dates_completes_and_corrects(taken, tmp_path):
     assert (nadir.name, fore.name) == ("20150607T080910", "20150607T081010")
     assert nadir.sun_direction == SunDirection(150.3, 50.8)
     assert fore.sun_direction is None
+
+
+@pytest.mark.parametrize("name", ["nadir", "NADIR.TIF", "nadir.ntf", "folder/nadir.tif"])
+def test_a_table_names_images_with_or_without_suffix(taken, tmp_path, name):
+    write_single(tmp_path, taken[0])
+    (tmp_path / "dates.csv").write_text(f"image,date,cloud_cover,off_nadir_deg\n{name},2015-06-07,0.25,-12\n")
+    (view,) = open_delivery(tmp_path).views
+    assert view.image.acquisition == Acquisition(date=datetime.date(2015, 6, 7), cloud_cover=0.25, off_nadir_deg=12.0)
+
+
+def test_a_table_of_panchromatic_images_leaves_them_their_colours(made, tmp_path):
+    delivery = shutil.copytree(made("maxar"), tmp_path / "delivery")
+    indices = sorted(path.name for path in delivery.rglob("*P1BS*.TIL"))
+    rows = [f"{name},2015-06-0{day},08:09:10" for day, name in enumerate(indices, 1)]
+    (delivery / "dates.csv").write_text("\n".join(["image,date,time", *rows, ""]))
+    views = open_delivery(delivery).views
+    assert [view.name for view in views] == ["WV03_20150601T080910", "WV03_20150602T080910"]
+    assert all(view.partner is not None for view in views)
 
 
 def test_what_is_left_out_is_named(taken, tmp_path):

@@ -274,7 +274,21 @@ def test_catalogues_that_lead_back_or_are_none(taken, tmp_path):
         ("image,day\nnadir.tif,2014-10-05\n", "is no table of dates"),
         ("image,date\nnadir.tif,2014-10-05\nnadir.tif,2014-10-06\n", "line 3: 'nadir' is there twice"),
         ("image,date\nnadir.tif,2014-13-05\n", "line 2: '2014-13-05' is no day"),
-        ("", "is no table of dates"),
+        ("", "dates.csv is empty. Fill it, or remove it."),
+        ("image,date\n", "has no line below the names of its columns"),
+        ("image;date\nnadir.tif;2014-10-05\n", "has semicolons between its columns. Write commas"),
+        (
+            "image,date,sunaz\nnadir.tif,2014-10-05,3\n",
+            "line 1: the column 'sunaz' is not known. Known are image, date",
+        ),
+        ("image,date\n\nnadir.tif,2014-10-05,3\n", "line 3: it has more values than the first line names columns"),
+        ("image,date\n,2014-10-05\n", "line 2: it names no image"),
+        ("image,date\nfoo.tif,2014-10-05\n", "line 2: there is no image 'foo.tif'. There are nadir.tif; correct"),
+        ("image,date,sun_azimuth,sun_elevation\nnadir.tif,2014-10-05,950,50\n", "line 2: '950' in sun_azimuth is not"),
+        ("image,date,sun_azimuth,sun_elevation\nnadir.tif,2014-10-05,150,0\n", "line 2: '0' in sun_elevation is not"),
+        ("image,date,sun_azimuth\nnadir.tif,2014-10-05,150\n", "line 2: sun_azimuth tells no direction without"),
+        ("image,date,cloud_cover\nnadir.tif,2014-10-05,50\n", "line 2: '50' in cloud_cover is not a share from 0 to 1"),
+        ("image,date,incidence\nnadir.tif,2014-10-05,abc\n", "line 2: 'abc' in incidence is not an angle from -89"),
     ],
 )
 def test_tables_of_dates_that_are_none(taken, tmp_path, table, says):

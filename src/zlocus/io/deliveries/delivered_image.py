@@ -53,10 +53,11 @@ class SetAside:
 @dataclass(frozen=True)
 class Found:
     """What a reader finds in a delivery. images : to be matched, or to give colours; set_aside : what it knows and
-    leaves out."""
+    leaves out; table : of dates, which completes what the vendors' files say, None without one."""
 
     images: tuple[DeliveredImage, ...] = ()
     set_aside: tuple[SetAside, ...] = ()
+    table: Path | None = None
 
     @property
     def claimed(self) -> set[Path]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from zlocus.core.errors import InputError
 from zlocus.core.scene import Acquisition
 from zlocus.io.archives import is_archive, is_archived, is_folder_in_archive, path_in_archive
-from zlocus.io.deliveries.acquisition_table import find_table, read_acquisition_table
+from zlocus.io.deliveries.acquisition_table import dated_images, find_table
 from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Reader, SetAside
 from zlocus.io.deliveries.dimap_products import dimap_input, dimap_products
 from zlocus.io.deliveries.gaofen_products import gaofen_products
@@ -80,7 +80,11 @@ def open_delivery(path: Path) -> Delivery:
     for image in found.images:
         _check_shape(image)
     images = _unique(found.images)
-    partners = {image.product: partner for image in images if (partner := colour_partner(image, images))}
+    # A table need not name the multispectral image of a pass, whose time by the vendor's files still tells its partner.
+    partners = _partners(images, images)
+    if found.table is not None:
+        images = dated_images(images, [each.path for each in found.set_aside], found.table)
+        partners = _partners([image for image in images if image.product not in partners], images) | partners
     colours = {partner.image.product for partner in partners.values()}
     for sentence in contradictions(images, {*partners, *colours}):
         raise InputError(sentence)
@@ -91,6 +95,11 @@ def open_delivery(path: Path) -> Delivery:
     return Delivery(path, tuple(sorted(views, key=_time_and_name)), tuple(aside))
 
 
+def _partners(images: Sequence[DeliveredImage], all_images: Sequence[DeliveredImage]) -> dict[str, ColourPartner]:
+    """The image that gives the colours of each image, by the product of the latter. all_images : among which it is."""
+    return {image.product: partner for image in images if (partner := colour_partner(image, all_images))}
+
+
 def _time_and_name(view: DeliveredView) -> tuple[str, str]:
     """Views are in order of their acquisition; those whose time is not known come last."""
     time = view.image.acquisition.time
@@ -98,7 +107,7 @@ def _time_and_name(view: DeliveredView) -> tuple[str, str]:
 
 
 def _found(path: Path) -> Found:
-    """What the readers find. A table of dates completes what the vendors' files say."""
+    """What the readers find."""
     if path.suffix.lower() in STAC_SUFFIXES:
         return stac_input(path)
     if path.suffix.lower() == TIL_SUFFIX:
@@ -111,17 +120,7 @@ def _found(path: Path) -> Found:
         more = reader(left) if left else Found()
         found = Found(found.images + more.images, found.set_aside + more.set_aside)
         left = [each for each in left if each not in more.claimed]
-    table = find_table(files)
-    if table is None:
-        return found
-    acquisitions = read_acquisition_table(table)
-    return replace(found, images=tuple(_with_dates(image, acquisitions) for image in found.images))
-
-
-def _with_dates(image: DeliveredImage, acquisitions: dict[str, Acquisition]) -> DeliveredImage:
-    """The image with what a table says of it. The table has precedence, because someone made it for these images."""
-    known = acquisitions.get(image.pixels.stem.lower()) or acquisitions.get(image.product.lower())
-    return image if known is None else replace(image, acquisition=known.completed_by(image.acquisition))
+    return replace(found, table=find_table(files))
 
 
 def _check_shape(image: DeliveredImage) -> None:
