@@ -572,6 +572,26 @@ def test_every_reason_has_a_colour_of_its_group():
     assert len(set(colours)) == len(colours)
 
 
+def test_gaps_below_masks_are_no_lack_of_images(made):
+    """In the summary and in the map of reasons."""
+    found = survey_rasters(made)
+    codes = np.zeros_like(found.codes)
+    for code, n in ((0, 70), (Quality.MASKED, 20), (Quality.UNSEEN, 10), (Quality.MASKED | Quality.OUTSIDE, 30)):
+        codes[int(code)] = n
+    counted = replace(found, codes=codes, n_heights=70)
+    assert counted.n_masked == 20
+    assert words.what_is_missing(counted) == (
+        "30.0 % of the requested cells have no height, mostly because: masks leave fewer than two images (20.0 %); "
+        f"{words.MEANINGS[Quality.UNSEEN]} (10.0 %). A cell may have both reasons."
+    )
+    masked, unseen, water = maps.groups_of(
+        np.array([int(Quality.MASKED), int(Quality.UNSEEN), int(Quality.MASKED | Quality.WATER)])
+    )
+    assert "masks leave" in maps.FLAG_GROUPS[masked][0]
+    assert "covered by fewer than two images" in maps.FLAG_GROUPS[unseen][0]
+    assert "WATER" in maps.FLAG_GROUPS[water][0]
+
+
 def test_levelled_water_is_counted_as_water_alone(made):
     """Neither as filled nor as a plane, and not among the cells that should be matched."""
     found = survey_rasters(made)

@@ -32,10 +32,11 @@ STOPS = 17
 TICKS = 5
 WHITE = (255, 255, 255)
 # Groups of flags with the colours of Okabe and Ito, which colour-blind readers can distinguish. A cell belongs to the
-# first group that has one of its flags; to that of WATER where it has both bits.
+# first group that has one of its flags; to those of MASKED and WATER where it has both bits.
 FLAG_GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
-    ("outside the area, or covered by fewer than two images", Quality.OUTSIDE | Quality.UNSEEN, WHITE),
     ("water, levelled (WATER)", Quality.WATER, (10, 30, 130)),
+    ("no height: masks leave fewer than two images (UNSEEN with IMAGE_EXCLUDED)", Quality.MASKED, (120, 80, 170)),
+    ("outside the area, or covered by fewer than two images", Quality.OUTSIDE | Quality.UNSEEN, WHITE),
     ("filled from its neighbours (FILLED)", Quality.FILLED, (86, 180, 233)),
     ("no height: tile failed (FAILED)", Quality.FAILED, (90, 60, 20)),
     ("no height: end of the height range (RANGE_END)", Quality.RANGE_END, (213, 94, 0)),
@@ -47,6 +48,7 @@ FLAG_GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
     ("height of a fitted plane (PLANE)", Quality.PLANE, (0, 158, 115)),
     ("height with another note (JUMP, UNREFINED, IMAGE_EXCLUDED)", Quality(0xFFFF), (240, 228, 66)),
 )
+TWO_BITS = (Quality.MASKED, Quality.WATER)
 ERROR_ALT = "Error of height: red where the surface is too high, blue where it is too low; white where it is not known."
 NO_FLAG = ("height without a warning", (225, 225, 225))
 
@@ -189,7 +191,7 @@ def groups_of(code: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of the first of `FLAG_GROUPS` to which values of quality.tif belong; `len(FLAG_GROUPS)` without one."""
     group = np.full(code.shape, len(FLAG_GROUPS))
     for k, (_, flags, _) in reversed(list(enumerate(FLAG_GROUPS))):
-        group[(code & int(flags)) == int(flags) if flags is Quality.WATER else (code & int(flags)) != 0] = k
+        group[(code & int(flags)) == int(flags) if flags in TWO_BITS else (code & int(flags)) != 0] = k
     return group
 
 

@@ -76,6 +76,13 @@ class Survey:
         """Number of cells whose height was matched, not filled."""
         return self.n_heights - self.count(Quality.FILLED) - self.count(Quality.WATER)
 
+    @property
+    def n_masked(self) -> int:
+        """Number of cells of the requested area for which masks leave fewer than two images; none of levelled water."""
+        codes = np.arange(N_CODES, dtype=np.uint16)
+        is_masked = (codes & int(Quality.MASKED | Quality.OUTSIDE)) == int(Quality.MASKED)
+        return int(self.codes[is_masked & ~is_water(codes)].sum())
+
     def count(self, flag: Quality) -> int:
         """Number of cells of the requested area that have a flag; for OUTSIDE, of the whole grid.
 

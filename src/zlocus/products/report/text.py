@@ -38,6 +38,7 @@ MEANINGS = {
     Quality.PLANE: "without texture of its own; the height is that of a plane fitted to the whole segment",
     Quality.WATER: "water; the height is the level of its whole surface (the bits FILLED and PLANE together)",
 }
+MASKED_MEANING = "masks leave fewer than two images"
 # Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
 DESPITE_PEAK = {
     Quality.NO_MATCH: "the semi-global constraint puts the surface at a height that agrees with its neighbours, which "
@@ -250,8 +251,13 @@ def what_is_missing(survey: Survey) -> str:
     n_missing = survey.n_requested - survey.n_heights
     if n_missing <= 0:
         return "Every cell of the area has a height."
-    why = [(survey.count(flag), MEANINGS[flag]) for flag in EMPTY if flag is not Quality.OUTSIDE]
-    common = sorted((each for each in why if each[0]), key=lambda each: -each[0])[:2]
+    others = EMPTY & ~(Quality.OUTSIDE | Quality.UNSEEN)
+    why = [
+        (survey.n_masked, MASKED_MEANING),
+        (survey.count(Quality.UNSEEN) - survey.n_masked, MEANINGS[Quality.UNSEEN]),
+        *((survey.count(flag), MEANINGS[flag]) for flag in others),
+    ]
+    common = sorted((each for each in why if each[0] > 0), key=lambda each: -each[0])[:2]
     reasons = "; ".join(f"{meaning} ({percent(n, survey.n_requested)})" for n, meaning in common)
     said = f"{percent(n_missing, survey.n_requested)} of the requested cells have no height, mostly because: {reasons}."
     return f"{said} A cell may have both reasons." if len(common) > 1 else said
