@@ -68,7 +68,7 @@ def test_the_date_of_a_view_is_that_of_the_scene_file_else_that_of_its_image(tmp
 def test_utm_zone_of_south_and_date_line(tmp_path, lon: float, lat: float, epsg: int):
     fields = RPC.moved(-20000, -20000)
     rpc = type(RPC)(**(vars_of(fields) | {"lon_off": lon, "lat_off": lat}))
-    paths = [write_image(tmp_path / f"{name}.tif", PIXELS, rpc) for name in "ab"]
+    paths = [write_image(tmp_path / f"{name}.tif", PIXELS, rpc.moved(0, row)) for row, name in enumerate("ab")]
     assert open_scene(paths).crs == CRS.from_epsg(epsg)
 
 
@@ -99,10 +99,10 @@ def test_crs_that_cannot_be_a_grid(pair, crs: int, message: str):
 
 
 def test_names_of_equal_stems_tell_the_folder(tmp_path):
-    paths = [crop(tmp_path / "x", "a"), crop(tmp_path / "y", "a"), crop(tmp_path / "y", "b")]
+    paths = [crop(tmp_path / "x", "a"), crop(tmp_path / "y", "a", 20100), crop(tmp_path / "y", "b", 20200)]
     assert [view.name for view in open_scene(paths).views] == ["x/a", "y/a", "b"]
     (tmp_path / "z").mkdir()
-    paths = [crop(tmp_path / "y", "a"), crop(tmp_path / "z" / "y", "a")]
+    paths = [crop(tmp_path / "y", "a"), crop(tmp_path / "z" / "y", "a", 20100)]
     names = [view.name for view in open_scene(paths).views]
     assert names == [(path.with_suffix("")).resolve().as_posix() for path in paths]
 

@@ -123,7 +123,9 @@ def test_side_files(tmp_path, good_pair, name, damage):
 @pytest.mark.parametrize("command", ["dsm", "doctor"])
 def test_options(tmp_path, good_pair, command, damage):
     path = CASES["config-toml"].write(tmp_path)
-    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    content = DAMAGES[damage](path.read_bytes())
+    # The first half of a number is one too, unlike a name without its value.
+    path.write_bytes(content[: content.rindex(b"=")] if damage == "cut" else content)
     assert "config.toml" in refused(tmp_path, command, *good_pair, "--config", path, "-o", tmp_path / "out")
 
 

@@ -8,7 +8,6 @@ import os
 import pickle
 import re
 import shutil
-import tarfile
 import zipfile
 from html.parser import HTMLParser
 from pathlib import Path

@@ -125,7 +125,7 @@ def test_a_signal_stops_the_run_within_seconds_and_the_run_is_resumed(
     check_end(process.returncode, number, stderr)
     _, alive = psutil.wait_procs(children, STOPS_WITHIN_S)
     assert not [one for one in alive if one.status() != psutil.STATUS_ZOMBIE]
-    assert "tiles are finished and kept: the same command resumes from there" in stderr
+    assert "finished and kept: the same command resumes from there" in stderr
     n = n_finished(out)
     said = given_again(command(images("sine"), out, tmp_path))
     assert f"{n} of " in said

@@ -51,3 +51,7 @@ class TileError(ZlocusError):
 
 class ZlocusWarning(UserWarning):
     """A fact that the user should know and that does not stop the run."""
+
+
+class ZlocusNote(ZlocusWarning):
+    """A fact that the user may like to know, and that makes no result worse."""

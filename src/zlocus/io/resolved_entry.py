@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zlocus.core.errors import ZlocusWarning
+from zlocus.core.errors import ZlocusNote, ZlocusWarning
 from zlocus.core.scene import NOT_KNOWN, Acquisition
 from zlocus.io.archives import is_archived, member_of
 from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.colour_image import ColourImage
+from zlocus.io.deliveries.delivered_image import RefusedProduct
 from zlocus.io.deliveries.delivery import MAX_NAMED, DeliveredView, Delivery, describe, is_delivery, open_delivery
 from zlocus.io.masks.mask_entry import MaskEntry
 from zlocus.io.masks.vendor_masks import vendor_kind, vendor_mask
@@ -37,20 +38,23 @@ class ResolvedEntry:
     masks: tuple[MaskEntry, ...] = ()
 
 
-def entries_of(paths: Sequence[Path]) -> tuple[ResolvedEntry, ...]:
+def entries_of(paths: Sequence[Path], refused: list[RefusedProduct] | None = None) -> tuple[ResolvedEntry, ...]:
     """The views that some images and deliveries name, each with a name of its own.
+
+    refused : see `open_delivery`.
 
     Raises
     ------
     InputError
         A delivery holds no image, or is damaged.
     """
-    delivered = {path: open_delivery(path) for path in paths if is_delivery(path)}
+    delivered = {path: open_delivery(path, refused) for path in paths if is_delivery(path)}
     images = [path for path in paths if path not in delivered]
     entries = [ResolvedEntry(name, path, RpcCamera()) for name, path in zip(_unique_names(images), images, strict=True)]
     for delivery in delivered.values():
-        if delivery.set_aside:
-            warnings.warn(describe(delivery), ZlocusWarning, stacklevel=2)
+        if delivery.set_aside or delivery.lone:
+            category = ZlocusWarning if delivery.is_doubtful else ZlocusNote
+            warnings.warn(describe(delivery), category, stacklevel=2)
         _warn_of_missing_masks(delivery)
         entries += [_entry(view) for view in delivery.views]
     _warn_of_slow(entries)

@@ -39,6 +39,7 @@ from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.cameras.shared_rpc import ImageRpc, shared_rpc_message, shared_rpcs
 from zlocus.io.colour_entry import ColourEntry
 from zlocus.io.crs import check_fits, checked_crs, local_frame, utm_zone
+from zlocus.io.deliveries.delivered_image import RefusedProduct
 from zlocus.io.images import (
     RasterImage,
     check_content,
@@ -326,21 +327,18 @@ class _OpenedView:
         return self.camera.centre((2 * top + rows, 2 * left + cols))
 
     @property
-    def acquisition(self) -> Acquisition:
-        """What is known of the exposure."""
-        return self.entry.acquisition.completed_by(self.image.acquisition)
-
-    @property
     def image_rpc(self) -> ImageRpc | None:
         """The image with its RPC; None where the camera is another one."""
         if not isinstance(self.camera, RpcSource):
             return None
         rpc = self.camera.rpc.moved(*(self.camera.shift or (0.0, 0.0)))
-        return ImageRpc(self.entry.path, self.image.shape, self.acquisition, rpc)
+        acquisition = self.entry.acquisition.completed_by(self.image.acquisition)
+        return ImageRpc(self.entry.path, self.image.shape, acquisition, rpc)
 
     def view(self, crs: CRS) -> View:
         """The view in the frame of the scene."""
-        entry, acquisition = self.entry, self.acquisition
+        entry = self.entry
+        acquisition = entry.acquisition.completed_by(self.image.acquisition)
         sensor = self.camera.sensor(crs)
         image = self._masked_image(sensor, crs)
         return View(entry.name, entry.path, image, sensor, self.camera.files, acquisition)
@@ -363,7 +361,10 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[Refu
     if scene_files:
         scene_input = _from_scene_file(scene_files[0], crs, refused)
     else:
-        scene_input = _SceneInput(entries_of(paths), Path(), crs)
+        products: list[RefusedProduct] | None = None if refused is None else []
+        scene_input = _SceneInput(entries_of(paths, products), Path(), crs)
+        if refused is not None:
+            refused += [RefusedView(each.path.stem, each.path, each.reason) for each in products or ()]
     if scene_input.crs is not None and not is_local(scene_input.crs):
         scene_input = replace(scene_input, crs=checked_crs(scene_input.crs))
     _check_distinct([entry.path for entry in scene_input.entries])

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from affine import Affine
 
 from made_up_deliveries import (
     CLOUD,
@@ -203,10 +204,11 @@ def test_a_folder_in_an_archive_and_one_index_are_inputs_too(made, taken, tmp_pa
     archive = zipped(made("dimap"), tmp_path / "d.zip")
     inside = [f"/vsizip/{archive}/delivery/PROD_{shot.name}" for shot in taken]
     assert len(open_scene([*map(type(archive), inside)]).views) == 2
-    indices = sorted(made("dimap").rglob("DIM_*_P_*.XML")) + sorted(made("maxar").rglob("*.TIL"))[:1]
-    scene = open_scene(indices)
-    assert [view.name for view in scene.views][:2] == [f"PHR1A_{shot.time:%Y%m%dT%H%M%S}" for shot in taken[::-1]]
-    assert np.array_equal(pixels(scene.views[2]), taken[0].grey)
+    indices = sorted(made("dimap").rglob("DIM_*_P_*.XML"))
+    names = [view.name for view in open_scene(indices).views]
+    assert names == [f"PHR1A_{shot.time:%Y%m%dT%H%M%S}" for shot in taken[::-1]]
+    scene = open_scene([indices[0], sorted(made("maxar").rglob("*.TIL"))[0]])
+    assert np.array_equal(pixels(scene.views[1]), taken[0].grey)
 
 
 def test_a_table_of_dates_completes_and_corrects(taken, tmp_path):
@@ -280,6 +282,22 @@ def test_results_of_zlocus_are_no_part_of_a_delivery(taken, tmp_path):
     delivery = open_delivery(tmp_path)
     assert len(delivery.views) == 2
     assert not delivery.set_aside
+
+
+def test_maps_in_a_delivery_are_no_doubt_and_images_without_a_camera_are(taken, tmp_path):
+    root = planet_delivery(tmp_path / "d", taken)
+    place = {"crs": "EPSG:32631", "transform": Affine(1.0, 0.0, 5e5, 0.0, -1.0, 5e6)}
+    write_image(root / "map.tif", taken[0].grey, **place)
+    delivery = open_delivery(root)
+    assert not delivery.is_doubtful
+    assert "2 views, 2 of them with the colours" in describe(delivery)
+    assert describe(delivery).endswith("Left out: map.tif (is a map or a product of one, and has no RPC).")
+    next(root.glob("*nadir_basic_panchromatic_dn.tif")).rename(root / "pan.tif")
+    delivery = open_delivery(root)
+    assert delivery.is_doubtful
+    assert "pan.tif (has no RPC" in describe(delivery)
+    assert "nadir_basic_panchromatic_udm2.tif (is the mask of an image that is missing" in describe(delivery)
+    assert describe(delivery).endswith("of its pass and ground was found: SSC2_20141005T160138.")
 
 
 def test_what_is_a_delivery(tmp_path, made):

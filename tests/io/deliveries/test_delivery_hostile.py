@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import tarfile
 import zipfile
@@ -10,11 +11,20 @@ import zipfile
 import numpy as np
 import pytest
 
-from made_up_deliveries import dimap_delivery, maxar_delivery, shots, stac_delivery, write_single, zipped
+from made_up_deliveries import (
+    dimap_delivery,
+    gaofen_delivery,
+    maxar_delivery,
+    shots,
+    stac_delivery,
+    write_single,
+    zipped,
+)
 from rpc_fixtures import write_image
 from zlocus.core.errors import InputError
 from zlocus.io.archives import SMALL_BYTES
-from zlocus.io.deliveries.delivery import open_delivery
+from zlocus.io.deliveries.delivery import describe, open_delivery
+from zlocus.io.scene_file import open_usable_views
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -206,8 +216,11 @@ def test_metadata_that_contradict_each_other(taken, tmp_path):
     changed(one(root, "DIM_*_MS_*.XML"), "<NROWS>36</NROWS>", "<NROWS>38</NROWS>")
     assert "say that the image has 38 x 37 pixels" in refused(root)
     root = dimap_delivery(tmp_path / "e", taken)
-    one(root, "RPC_*_P_*.XML").unlink()
-    assert "Add the RPC_*.XML of the product" in refused(root)
+    rpc = one(root, "RPC_*_P_*.XML")
+    rpc.unlink()
+    assert f"names {rpc.name}, which is missing. Add it" in refused(root)
+    changed(one(root, "DIM_*_P_*.XML"), f'href="{rpc.name}"', 'href="none"')
+    assert f"holds no RPC and names none. Add {rpc.name} beside it" in refused(root)
 
 
 def test_parts_of_a_product_that_are_missing(taken, tmp_path):
@@ -216,7 +229,45 @@ def test_parts_of_a_product_that_are_missing(taken, tmp_path):
     assert "Copy the whole product again" in refused(root)
     root = maxar_delivery(tmp_path / "r", taken)
     one(root, "*P1BS*.RPB").unlink()
-    assert ".RPB beside it. Add it" in refused(root)
+    assert ".RPB with its RPC beside it. Add it" in refused(root)
+    root = maxar_delivery(tmp_path / "isd", taken, isd="")
+    one(root, "*P1BS*.XML").unlink()
+    assert ".XML with its RPC beside it. Add it" in refused(root)
+    root = gaofen_delivery(tmp_path / "g", taken)
+    one(root, "*PAN1.rpb").unlink()
+    assert "PAN1.rpb is missing beside it. Add it" in refused(root)
+    root = dimap_delivery(tmp_path / "d", taken)
+    index = one(root, "DIM_*_P_*.XML")
+    index.unlink()
+    assert re.search(rf"{index} is missing, .* how IMG_.*_R1C1.TIF and 5 more tiles lie", refused(root))
+
+
+def test_all_faults_of_a_delivery_are_found(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "m", taken)
+    one(root, "*P001_PAN/*P1BS*.RPB").unlink()
+    one(root, "*P002_PAN/*R2C1*.TIF").unlink()
+    usable = open_usable_views([root])
+    assert usable.scene is None
+    assert "RPB with its RPC beside it" in usable.refused[0].reason
+    assert "R2C1" in usable.refused[1].reason
+    assert len(usable.refused) == 2
+    root = maxar_delivery(tmp_path / "one", taken)
+    changed(one(root, "*P001_PAN/*.IMD"), "numRows = 148;", "numRows = 148;\nnumRows = 150;")
+    usable = open_usable_views([root])
+    # The multispectral image of the pass is no view of its own.
+    assert [view.name for view in usable.scene.views] == ["WV03_20141005T160218"]
+    assert "gives 'numRows' twice" in usable.refused[0].reason
+    assert len(usable.refused) == 1
+
+
+@pytest.mark.parametrize(("write", "rpc"), [(dimap_delivery, "RPC_*_MS_*.XML"), (maxar_delivery, "*M1BS*.RPB")])
+def test_a_multispectral_image_without_an_rpc_gives_no_colours(taken, tmp_path, write, rpc):
+    root = write(tmp_path / "d", taken)
+    one(root, rpc).unlink()
+    delivery = open_delivery(root)
+    assert sorted(view.partner is None for view in delivery.views) == [False, True]
+    assert " (gives no colours: " in describe(delivery)
+    assert not delivery.is_doubtful
 
 
 def test_ortho_images_are_named(taken, tmp_path):

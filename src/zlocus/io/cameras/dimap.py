@@ -118,13 +118,17 @@ def rpc_file_of(path: Path, root: Element) -> Path:
     InputError
         There is neither.
     """
-    for element in root.iter():
-        name = Path(element.attrib.get("href", "")).name
-        if re.fullmatch(r"RPC_.*\.XML", name, re.IGNORECASE) and file_exists(path.with_name(name)):
+    hrefs = [Path(element.attrib.get("href", "")).name for element in root.iter()]
+    named = [name for name in hrefs if re.fullmatch(r"RPC_.*\.XML", name, re.IGNORECASE)]
+    for name in named:
+        if file_exists(path.with_name(name)):
             return path.with_name(name)
     sibling = path.with_name(re.sub(r"^DIM_", "RPC_", path.name))
     if sibling == path or not file_exists(sibling):
-        raise InputError(f"{path} holds no RPC and names none that exists. Add the RPC_*.XML of the product beside it.")
+        if named:
+            raise InputError(f"{path} names {named[0]}, which is missing. Add it.")
+        wanted = "the RPC_*.XML of the product" if sibling == path else sibling.name
+        raise InputError(f"{path} holds no RPC and names none. Add {wanted} beside it.")
     return sibling
 
 

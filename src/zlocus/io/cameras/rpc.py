@@ -66,6 +66,18 @@ def _isd_with_rpc(image: Path) -> Path | None:
     return None
 
 
+def has_rpc_tag(image: Path) -> bool:
+    """Whether an image file holds an RPC itself.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    with open_raster(image) as source:
+        return bool(source.tags(ns="RPC"))
+
+
 def _from_tag(image: Path) -> RpcCoefficients:
     """The RPC stored in an image file (RPC tag of GeoTIFF, RPC00B of NITF), read by GDAL."""
     with open_raster(image) as source:

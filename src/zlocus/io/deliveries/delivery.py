@@ -8,14 +8,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zlocus.core.errors import InputError
+from zlocus.core.quoting import counted
 from zlocus.core.scene import Acquisition
 from zlocus.io.archives import is_archive, is_archived, is_folder_in_archive, path_in_archive
+from zlocus.io.cameras.rpc import read_rpc
 from zlocus.io.deliveries.acquisition_table import dated_images, find_table
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Reader, SetAside
+from zlocus.io.deliveries.delivered_image import (
+    DeliveredImage,
+    Found,
+    Reader,
+    RefusedProduct,
+    SetAside,
+    Spectrum,
+)
 from zlocus.io.deliveries.dimap_products import dimap_input, dimap_products
 from zlocus.io.deliveries.gaofen_products import gaofen_products
 from zlocus.io.deliveries.geoeye_products import geoeye_products
-from zlocus.io.deliveries.ground_agreement import contradictions
+from zlocus.io.deliveries.ground_agreement import are_of_one_pass, contradictions
 from zlocus.io.deliveries.listing import files_in
 from zlocus.io.deliveries.maxar_products import maxar_input, maxar_products
 from zlocus.io.deliveries.pairing import ColourPartner, colour_partner
@@ -53,6 +62,19 @@ class Delivery:
     views: tuple[DeliveredView, ...]
     set_aside: tuple[SetAside, ...]
 
+    @property
+    def lone(self) -> tuple[DeliveredView, ...]:
+        """The multispectral images that are matched beside panchromatic ones, and give no image its colours."""
+        spectra = [view.image.spectrum for view in self.views]
+        if Spectrum.PANCHROMATIC not in spectra:
+            return ()
+        return tuple(view for view in self.views if view.image.spectrum is Spectrum.MULTISPECTRAL)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it may lack an image that was meant to be matched."""
+        return bool(self.lone) or any(each.is_doubtful for each in self.set_aside)
+
 
 def is_delivery(path: Path) -> bool:
     """Whether an input is a delivery: a folder, an archive, an index of tiles, or a file of STAC."""
@@ -63,8 +85,10 @@ def is_delivery(path: Path) -> bool:
     return path.is_dir()
 
 
-def open_delivery(path: Path) -> Delivery:
+def open_delivery(path: Path, refused: list[RefusedProduct] | None = None) -> Delivery:
     """Find the views of a delivery.
+
+    refused : list to which products that cannot be used are added, and the others are found; None: they are errors.
 
     Raises
     ------
@@ -72,13 +96,17 @@ def open_delivery(path: Path) -> Delivery:
         It holds no image with a camera, or something in it is damaged, hostile or contradicts itself.
     """
     path = Path(path)
-    found = _found(path)
+    delivered = _found(path)
+    found = _usable(delivered)
+    if refused is not None:
+        refused += found.refused
+    elif found.refused:
+        raise InputError(found.refused[0].reason)
+    aside = tuple(each for each in found.set_aside if each.reason)
     if not found.images:
-        reasons = [f"{each.path.name} {each.reason}" for each in found.set_aside if each.reason]
-        why = f": {reasons[0]}" if reasons else ""
-        raise InputError(f"{path} holds no image with a camera{why}. Give the folder that the vendor delivered.")
-    for image in found.images:
-        _check_shape(image)
+        if found.refused:
+            return Delivery(path, (), aside)
+        raise InputError(_nothing_in(path, aside))
     images = _unique(found.images)
     # A table need not name the multispectral image of a pass, whose time by the vendor's files still tells its partner.
     partners = _partners(images, images)
@@ -86,13 +114,60 @@ def open_delivery(path: Path) -> Delivery:
         images = dated_images(images, [each.path for each in found.set_aside], found.table)
         partners = _partners([image for image in images if image.product not in partners], images) | partners
     colours = {partner.image.product for partner in partners.values()}
-    for sentence in contradictions(images, {*partners, *colours}):
-        raise InputError(sentence)
+    for pair, sentence in contradictions(images, {*partners, *colours}):
+        if refused is None:
+            raise InputError(sentence)
+        refused += [RefusedProduct(image.pixels, sentence) for image in pair]
+        colours |= {image.product for image in pair}
+    if found.refused and any(image.spectrum is Spectrum.PANCHROMATIC for image in delivered.images):
+        # Their panchromatic images may be among those that cannot be used.
+        colours |= {image.product for image in images if image.spectrum is Spectrum.MULTISPECTRAL}
     matched = [image for image in images if image.product not in colours]
     names = _names(matched)
     views = [DeliveredView(names[image.product], image, partners.get(image.product)) for image in matched]
-    aside = [each for each in found.set_aside if each.reason]
-    return Delivery(path, tuple(sorted(views, key=_time_and_name)), tuple(aside))
+    return Delivery(path, tuple(sorted(views, key=_time_and_name)), aside)
+
+
+def _usable(found: Found) -> Found:
+    """What can be used of what the readers find. A multispectral image without a usable RPC is left out where there is
+    a panchromatic one of its pass, because it would give colours only."""
+    pans = [image for image in found.images if image.spectrum is Spectrum.PANCHROMATIC]
+    usable = Found((), found.set_aside, found.refused, found.table)
+    for image in found.images:
+        try:
+            _check_shape(image)
+        except InputError as error:
+            usable = usable.with_more(Found(refused=(RefusedProduct(image.pixels, str(error)),)))
+            continue
+        gives_colours = image.spectrum is Spectrum.MULTISPECTRAL and any(are_of_one_pass(pan, image) for pan in pans)
+        fault = _fault(image, with_rpc=gives_colours)
+        if not fault:
+            usable = usable.with_more(Found((image,)))
+        elif gives_colours:
+            aside = SetAside(image.pixels, f"gives no colours: {fault.rstrip('.')}")
+            usable = usable.with_more(Found(set_aside=(aside,)))
+        else:
+            usable = usable.with_more(Found(refused=(RefusedProduct(image.pixels, fault),)))
+    return usable
+
+
+def _fault(image: DeliveredImage, with_rpc: bool) -> str:
+    """Why an image cannot be used, as a sentence; empty where nothing is known against it. with_rpc : read its RPC."""
+    if image.missing_camera:
+        return image.missing_camera
+    try:
+        if with_rpc:
+            read_rpc(image.pixels, image.camera)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _nothing_in(path: Path, aside: Sequence[SetAside]) -> str:
+    """The sentence on a delivery without an image."""
+    reasons = [f"{each.path.name} {each.reason}" for each in aside]
+    why = f": {reasons[0]}" if reasons else ""
+    return f"{path} holds no image with a camera{why}. Give the folder that the vendor delivered."
 
 
 def _partners(images: Sequence[DeliveredImage], all_images: Sequence[DeliveredImage]) -> dict[str, ColourPartner]:
@@ -118,7 +193,7 @@ def _found(path: Path) -> Found:
     found, left = Found(), list(files)
     for reader in READERS:
         more = reader(left) if left else Found()
-        found = Found(found.images + more.images, found.set_aside + more.set_aside)
+        found = found.with_more(more)
         left = [each for each in left if each not in more.claimed]
     return replace(found, table=find_table(files))
 
@@ -161,17 +236,22 @@ def _name_of(acquisition: Acquisition) -> str:
 
 def describe(delivery: Delivery) -> str:
     """What was found, and what is left out, in sentences."""
-    n_views = len(delivery.views)
     n_coloured = sum(view.partner is not None for view in delivery.views)
     colours = f", {n_coloured} of them with the colours of a multispectral image" if n_coloured else ""
-    held = f"{delivery.path} holds {n_views} view{'s' if n_views != 1 else ''}{colours}"
+    sentences = [f"{delivery.path} holds {counted(len(delivery.views), 'view')}{colours}."]
     by_reason: dict[str, list[str]] = {}
     for each in delivery.set_aside:
         by_reason.setdefault(each.reason, []).append(each.path.name)
-    if not by_reason:
-        return f"{held}."
-    parts = []
-    for reason, names in by_reason.items():
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-        parts.append(f"{', '.join(names[:MAX_NAMED])}{more} ({reason})")
-    return f"{held}. Left out: {'; '.join(parts)}."
+    if by_reason:
+        parts = [f"{_some(names)} ({reason})" for reason, names in by_reason.items()]
+        sentences.append(f"Left out: {'; '.join(parts)}.")
+    if delivery.lone:
+        named = _some([view.name for view in delivery.lone])
+        why = "because no panchromatic image of its pass and ground was found"
+        sentences.append(f"Multispectral, and matched by itself, {why}: {named}.")
+    return " ".join(sentences)
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return f"{', '.join(names[:MAX_NAMED])}{more}"

@@ -9,6 +9,7 @@ Source: Airbus, Pleiades Imagery User Guide (2012), appendix on DIMAP V2.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -16,33 +17,65 @@ from xml.etree.ElementTree import Element
 from zlocus.core.errors import InputError
 from zlocus.core.scene import Acquisition
 from zlocus.io.cameras.dimap import rpc_file_of
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, SetAside, Spectrum
+from zlocus.io.deliveries.delivered_image import (
+    DeliveredImage,
+    Found,
+    RefusedProduct,
+    SetAside,
+    Spectrum,
+    found_in_products,
+)
 from zlocus.io.image_acquisition import first_number, sun_direction, time_in
 from zlocus.io.stored_files import file_exists
-from zlocus.io.tiled_products import DIMAP_INDEX, named_file, named_tiles, whole_number
+from zlocus.io.tiled_products import ADVICE, DIMAP_INDEX, named_file, named_tiles, whole_number
 from zlocus.io.vendor_xml import fields_of, plain_xml
 
 # What lies beside the images and is none: previews and icons.
 PREVIEWS = ("PREVIEW_", "ICON_")
+TILE_NAME = re.compile(r"IMG_(?P<product>.*)_R\d+C\d+\.(?:TIF|TIFF|JP2)", re.IGNORECASE)
 ORTHO = "is an ortho-image, whose pixels have no camera: order the product as PRIMARY (or SENSOR)"
 
 
 def dimap_products(files: Sequence[Path]) -> Found:
     """The images of all `DIM_*.XML` of a delivery."""
-    images, aside = [], []
-    for path in files:
-        if path.name.upper().startswith(PREVIEWS):
-            aside.append(SetAside(path, ""))
-        if DIMAP_INDEX.fullmatch(path.name) is None:
-            continue
-        root = plain_xml(path)
-        if root.find(".//Raster_Dimensions") is None:
-            continue
-        if (root.findtext(".//RASTER_GEOMETRY") or "").strip().upper() == "GROUND":
-            aside += [SetAside(each, ORTHO) for each in (path, *named_tiles(path))]
-            continue
-        images.append(dimap_image(path, root))
-    return Found(tuple(images), tuple(aside))
+    previews = tuple(SetAside(path, "") for path in files if path.name.upper().startswith(PREVIEWS))
+    indices = [path for path in files if DIMAP_INDEX.fullmatch(path.name) is not None]
+    # A product has a folder of its own, with all its files.
+    found = found_in_products(
+        indices, _product, lambda index: [path for path in files if path.is_relative_to(index.parent)]
+    )
+    return _without_index(files, found).with_more(Found(set_aside=previews)).with_more(found)
+
+
+def _product(path: Path) -> Found:
+    root = plain_xml(path)
+    if root.find(".//Raster_Dimensions") is None:
+        return Found()
+    if (root.findtext(".//RASTER_GEOMETRY") or "").strip().upper() == "GROUND":
+        return Found(set_aside=tuple(SetAside(each, ORTHO) for each in (path, *named_tiles(path))))
+    return Found((dimap_image(path, root),))
+
+
+def _without_index(files: Sequence[Path], found: Found) -> Found:
+    """The tiles that no index names, where an RPC of their product lies beside them: one refusal for each product."""
+    names = {path: match for path in files if (match := TILE_NAME.fullmatch(path.name)) is not None}
+    tiles: dict[Path, list[Path]] = {}
+    for path, match in names.items():
+        index = path.with_name(f"DIM_{match['product']}.XML")
+        if path not in found.claimed and path.with_name(f"RPC_{match['product']}.XML") in files:
+            tiles.setdefault(index, []).append(path)
+    return Found(
+        refused=tuple(
+            RefusedProduct(
+                index,
+                f"{index} is missing, so that it is not known how {named[0].name} and {len(named) - 1} more tiles lie. "
+                f"{ADVICE}",
+                frozenset(path for path in files if path.is_relative_to(index.parent)),
+            )
+            for index, named in tiles.items()
+            if len(named) > 1
+        )
+    )
 
 
 def dimap_image(path: Path, root: Element) -> DeliveredImage:
@@ -51,8 +84,13 @@ def dimap_image(path: Path, root: Element) -> DeliveredImage:
     Raises
     ------
     InputError
-        The index is damaged, or its RPC is missing.
+        The index is damaged.
     """
+    camera, missing_camera = None, ""
+    try:
+        camera = rpc_file_of(path, root)
+    except InputError as error:
+        missing_camera = str(error)
     tiles = named_tiles(path)
     groups = root.findall(".//Data_Access/Data_Files")
     # Where the bands are in several groups of files, the first group has red, green and blue; the others are claimed.
@@ -64,7 +102,7 @@ def dimap_image(path: Path, root: Element) -> DeliveredImage:
     return DeliveredImage(
         product=path.stem[len("DIM_") :],
         pixels=pixels,
-        camera=rpc_file_of(path, root),
+        camera=camera,
         acquisition=_acquisition(root),
         spectrum=_spectrum(root),
         colour_bands=_colour_bands(root),
@@ -72,6 +110,7 @@ def dimap_image(path: Path, root: Element) -> DeliveredImage:
         masks=tuple(mask for mask in masks if file_exists(mask)),
         missing_masks=tuple(mask for mask in masks if not file_exists(mask)),
         claimed=frozenset((path, *tiles, *others)),
+        missing_camera=missing_camera,
     )
 
 
@@ -141,7 +180,7 @@ def dimap_input(path: Path) -> Found:
     InputError
         It is the index of no image, or of an ortho-image.
     """
-    found = dimap_products([path])
+    found = _product(path)
     if not found.images:
         reason = found.set_aside[0].reason if found.set_aside else "is the index of no image"
         raise InputError(f"{path} {reason}.")

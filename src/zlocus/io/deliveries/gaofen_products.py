@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from zlocus.core.scene import Acquisition
-from zlocus.io.cameras.rpc import find_sidecar
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum
+from zlocus.io.cameras.rpc import find_sidecar, has_rpc_tag
+from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum, found_in_products
 from zlocus.io.image_acquisition import acquisition_from, first_number, sun_altitude_deg, sun_direction, time_in
 from zlocus.io.tiled_products import whole_number
 from zlocus.io.vendor_xml import fields_of, plain_xml
@@ -35,8 +35,12 @@ def gaofen_products(files: Sequence[Path]) -> Found:
     by_name: dict[Path, dict[str, Path]] = {}
     for path in files:
         by_name.setdefault(path.with_suffix(""), {})[path.suffix.lower()] = path
-    images = [image for parts in by_name.values() if (image := _product(parts)) is not None]
-    return Found(tuple(images))
+
+    def read(name: Path) -> Found:
+        image = _product(by_name[name])
+        return Found() if image is None else Found((image,))
+
+    return found_in_products(by_name, read, lambda name: by_name[name].values())
 
 
 def _product(parts: Mapping[str, Path]) -> DeliveredImage | None:
@@ -49,15 +53,18 @@ def _product(parts: Mapping[str, Path]) -> DeliveredImage | None:
     fields = fields_of(root)
     spectrum = Spectrum.PANCHROMATIC if PANCHROMATIC.search(pixels.stem) else Spectrum.OTHER
     spectrum = Spectrum.MULTISPECTRAL if MULTISPECTRAL.search(pixels.stem) else spectrum
+    camera = find_sidecar(pixels)
+    is_missing = camera is None and not has_rpc_tag(pixels)
     return DeliveredImage(
         product=pixels.stem,
         pixels=pixels,
-        camera=find_sidecar(pixels),
+        camera=camera,
         acquisition=_acquisition(fields),
         spectrum=spectrum,
         colour_bands=BLUE_GREEN_RED if spectrum is Spectrum.MULTISPECTRAL else None,
         shape=_shape(fields, parts[".xml"]),
         claimed=frozenset(parts.values()),
+        missing_camera=f"{pixels} has no RPC: {pixels.stem}.rpb is missing beside it. Add it." if is_missing else "",
     )
 
 

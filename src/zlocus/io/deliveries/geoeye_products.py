@@ -7,12 +7,12 @@ The first three digits of the number are the product image, of which the metadat
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from zlocus.core.scene import NOT_KNOWN, Acquisition
 from zlocus.io.cameras.rpc import find_sidecar
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum
+from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum, found_in_products
 from zlocus.io.image_acquisition import acquisition_from
 from zlocus.io.safe_text import read_text
 
@@ -34,25 +34,23 @@ VENDOR_NAMES = {
 def geoeye_products(files: Sequence[Path]) -> Found:
     """The images of all such products of a delivery."""
     by_name = {path.parent / path.name.lower(): path for path in files}
-    images = []
-    for path in files:
-        match = PRODUCT.fullmatch(path.name)
-        if match is None:
-            continue
-        metadata = by_name.get(path.parent / f"{match['order'].lower()}_metadata.txt")
-        kind, camera = match["kind"].lower(), find_sidecar(path)
-        images.append(
-            DeliveredImage(
-                product=path.stem,
-                pixels=path,
-                camera=camera,
-                acquisition=NOT_KNOWN if metadata is None else _acquisition(metadata, match["image"]),
-                spectrum=SPECTRA[kind],
-                colour_bands=BLUE_GREEN_RED if kind == "bgrn" else RED_GREEN_BLUE if kind == "rgb" else None,
-                claimed=frozenset(each for each in (camera, metadata) if each is not None),
-            )
-        )
-    return Found(tuple(images))
+    found = {path: match for path in files if (match := PRODUCT.fullmatch(path.name)) is not None}
+    return found_in_products(found, lambda path: Found((_image(path, found[path], by_name),)), lambda path: [path])
+
+
+def _image(path: Path, match: re.Match[str], by_name: Mapping[Path, Path]) -> DeliveredImage:
+    """The image of a file. by_name : the files of the delivery, by their paths with names in small letters."""
+    metadata = by_name.get(path.parent / f"{match['order'].lower()}_metadata.txt")
+    kind, camera = match["kind"].lower(), find_sidecar(path)
+    return DeliveredImage(
+        product=path.stem,
+        pixels=path,
+        camera=camera,
+        acquisition=NOT_KNOWN if metadata is None else _acquisition(metadata, match["image"]),
+        spectrum=SPECTRA[kind],
+        colour_bands=BLUE_GREEN_RED if kind == "bgrn" else RED_GREEN_BLUE if kind == "rgb" else None,
+        claimed=frozenset(each for each in (camera, metadata) if each is not None),
+    )
 
 
 def _acquisition(path: Path, image: str) -> Acquisition:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pyproj import CRS
@@ -25,26 +26,35 @@ MIN_COMMON = 0.25
 EARTH_RADIUS_M = 6_371_000.0
 
 
-def contradictions(images: Sequence[DeliveredImage], paired: Collection[str]) -> Iterator[str]:
-    """Sentences on images whose RPCs contradict each other. Images whose RPC cannot be read are passed over.
+class Contradiction(NamedTuple):
+    """Images whose RPCs contradict each other, and a sentence that says so."""
+
+    images: tuple[DeliveredImage, ...]
+    sentence: str
+
+
+def contradictions(images: Sequence[DeliveredImage], paired: Collection[str]) -> Iterator[Contradiction]:
+    """Images whose RPCs contradict each other. Images whose RPC cannot be read are passed over.
 
     paired : products of the panchromatic images that have colours, and of the images that give them.
     """
     known = {image.product: rpc for image in images if (rpc := _image_rpc(image)) is not None}
     for one, other in shared_rpcs(known.values(), products=True):
-        yield shared_rpc_message(one.path, other.path)
+        pair = tuple(image for image in images if image.pixels in (one.path, other.path))
+        yield Contradiction(pair, shared_rpc_message(one.path, other.path))
     left = [image for image in images if image.product not in paired and image.product in known]
     for pan in (image for image in left if image.spectrum is Spectrum.PANCHROMATIC):
         for colour in (image for image in left if image.spectrum is Spectrum.MULTISPECTRAL):
-            if not _are_of_one_pass(pan, colour):
+            if not are_of_one_pass(pan, colour):
                 continue
             divergence = _divergence(known[pan.product], known[colour.product])
             if divergence is not None and divergence > MAX_DIVERGENCE:
-                yield (
+                yield Contradiction(
+                    (pan, colour),
                     f"{pan.pixels} and {colour.pixels} are of one pass, but by their RPCs they look at the ground from "
                     f"directions {math.degrees(math.atan(divergence)):.0f} degrees apart: one of them has the RPC of "
                     f"another image, and heights would be wrong. Copy both again from their source; if the RPC of "
-                    f"{colour.pixels.name} is the wrong one, leaving that image out is enough."
+                    f"{colour.pixels.name} is the wrong one, leaving that image out is enough.",
                 )
 
 
@@ -57,7 +67,7 @@ def _image_rpc(image: DeliveredImage) -> ImageRpc | None:
         return None
 
 
-def _are_of_one_pass(one: DeliveredImage, other: DeliveredImage) -> bool:
+def are_of_one_pass(one: DeliveredImage, other: DeliveredImage) -> bool:
     """Whether one satellite took both within `MAX_SECONDS`, as far as that is known."""
     first, second = one.acquisition, other.acquisition
     if first.time is None or second.time is None or first.satellite != second.satellite:

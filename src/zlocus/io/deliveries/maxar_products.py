@@ -19,7 +19,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.scene import NOT_KNOWN
 from zlocus.io.cameras.isd import is_isd
 from zlocus.io.cameras.rpc import find_sidecar
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum
+from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum, found_in_products
 from zlocus.io.grouped_text import StatementGroup, read_groups
 from zlocus.io.image_acquisition import acquisition_from
 from zlocus.io.tiled_products import TIL_SUFFIX, named_tiles, whole_number
@@ -28,6 +28,7 @@ from zlocus.io.vendor_xml import fields_of, plain_xml
 PIXEL_SUFFIXES = (".tif", ".tiff", ".ntf")
 # Letters of the bands, as the groups BAND_R and BAND_N1 of a product name them, in the order of its bands.
 RED_GREEN_BLUE = ("R", "G", "B")
+TILE_PLACE = re.compile(r"_R\d+C\d+", re.ASCII)
 PAN_LEVEL = re.compile(r"-P\d[A-Z]{2}", re.ASCII)
 
 
@@ -48,8 +49,17 @@ def maxar_products(files: Sequence[Path]) -> Found:
     by_name: dict[Path, dict[str, Path]] = {}
     for path in files:
         by_name.setdefault(path.with_suffix(""), {})[path.suffix.lower()] = path
-    images = [image for stem in by_name if (image := _product(stem, by_name[stem])) is not None]
-    return Found(tuple(images))
+
+    def read(stem: Path) -> Found:
+        image = _product(stem, by_name[stem])
+        return Found() if image is None else Found((image,))
+
+    return found_in_products(by_name, read, lambda stem: [path for path in files if _is_of_product(path, stem)])
+
+
+def _is_of_product(path: Path, stem: Path) -> bool:
+    """Whether a file lies beside a product and has its name, or the name of one of its tiles."""
+    return path.parent == stem.parent and TILE_PLACE.sub("", path.stem) == stem.name
 
 
 def maxar_input(path: Path, files: Sequence[Path]) -> Found:
@@ -82,9 +92,11 @@ def _product(stem: Path, parts: Mapping[str, Path]) -> DeliveredImage | None:
             f"{described} describes an image, but there is no {stem.name}.TIL, .TIF or .NTF beside it. Copy the whole "
             "product again."
         )
-    camera = find_sidecar(stem.with_suffix(".TIL"))
+    camera, missing_camera = find_sidecar(stem.with_suffix(".TIL")), ""
     if camera is None and len(tiles) > 1:
-        raise InputError(f"{index} lists the tiles of an image, but there is no {stem.name}.RPB beside it. Add it.")
+        # Products without .IMD have the RPC in their XML of image support data.
+        name = f"{stem.name}.{'RPB' if imd is not None else 'XML'}"
+        missing_camera = f"{index} lists the tiles of an image, but there is no {name} with its RPC beside it. Add it."
     return DeliveredImage(
         product=stem.name,
         pixels=pixels,
@@ -94,6 +106,7 @@ def _product(stem: Path, parts: Mapping[str, Path]) -> DeliveredImage | None:
         colour_bands=None if said is None else _colour_bands(said.bands),
         shape=None if said is None else said.shape,
         claimed=frozenset((*parts.values(), *tiles)),
+        missing_camera=missing_camera,
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from zlocus.core.errors import InputError
 from zlocus.core.request_checks import IMAGE_SUFFIXES
 from zlocus.io.archives import is_archived
-from zlocus.io.cameras.rpc import find_sidecar
+from zlocus.io.cameras.rpc import find_sidecar, has_rpc_tag
 from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, SetAside
 from zlocus.io.open_raster import open_raster
 
@@ -30,17 +30,18 @@ def plain_images(files: Sequence[Path]) -> Found:
         if suffix in PREVIEW_SUFFIXES and camera is None:
             continue
         try:
-            has_rpc = camera is not None or _has_rpc_tag(path)
+            if camera is not None or has_rpc_tag(path):
+                images.append(DeliveredImage(product=path.stem, pixels=path, camera=camera))
+            else:
+                aside.append(_without_rpc(path))
         except InputError as error:
-            aside.append(SetAside(path, f"cannot be read ({error})"))
-            continue
-        if has_rpc:
-            images.append(DeliveredImage(product=path.stem, pixels=path, camera=camera))
-        else:
-            aside.append(SetAside(path, "has no RPC, in its tags or beside it"))
+            aside.append(SetAside(path, f"cannot be read ({error})", is_doubtful=True))
     return Found(tuple(images), tuple(aside))
 
 
-def _has_rpc_tag(path: Path) -> bool:
+def _without_rpc(path: Path) -> SetAside:
+    """Why an image without an RPC is left out. One that has a place on a map is none that was meant to be matched."""
     with open_raster(path) as source:
-        return bool(source.tags(ns="RPC"))
+        is_map = source.crs is not None and not source.transform.is_identity
+    reason = "is a map or a product of one, and has no RPC" if is_map else "has no RPC, in its tags or beside it"
+    return SetAside(path, reason, is_doubtful=not is_map)

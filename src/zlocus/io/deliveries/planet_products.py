@@ -13,7 +13,7 @@ from pathlib import Path
 
 from zlocus.core.scene import NOT_KNOWN, Acquisition
 from zlocus.io.cameras.rpc import find_sidecar
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, SetAside, Spectrum
+from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, SetAside, Spectrum, found_in_products
 from zlocus.io.image_acquisition import acquisition_from
 from zlocus.io.safe_documents import read_json
 
@@ -33,19 +33,27 @@ SPECTRA = {
 def planet_products(files: Sequence[Path]) -> Found:
     """The images of all SkySat scenes of a delivery."""
     found = {path: match for path in files if (match := PRODUCT.fullmatch(path.name)) is not None}
-    images, aside = [], []
     beside = set(files)
-    for path, match in found.items():
-        if MASK.fullmatch(match["rest"]):
-            continue
+    masks = [path for path, match in found.items() if MASK.fullmatch(match["rest"])]
+
+    def read(path: Path) -> Found:
+        match = found[path]
         kind = match["kind"].lower()
         if match["level"].lower() == "ortho":
-            aside.append(SetAside(path, "is an ortho-image, whose pixels have no camera: order the basic product"))
-        elif kind == "l1a_panchromatic" and any(_is_final(other, match["id"]) for other in found.values()):
-            aside.append(SetAside(path, "is an earlier level of the panchromatic image beside it"))
-        else:
-            images.append(_image(path, match, beside))
-    return Found(tuple(_with_missing_masks(images)), tuple(aside))
+            return _left_out(path, "is an ortho-image, whose pixels have no camera: order the basic product")
+        if kind == "l1a_panchromatic" and any(_is_final(other, match["id"]) for other in found.values()):
+            return _left_out(path, "is an earlier level of the panchromatic image beside it")
+        return Found((_image(path, match, beside),))
+
+    products = found_in_products([path for path in found if path not in masks], read, lambda path: [path])
+    products = replace(products, images=tuple(_with_missing_masks(products.images)))
+    lone = [path for path in masks if path not in products.claimed and find_sidecar(path) is None]
+    reason = "is the mask of an image that is missing, or has another name"
+    return products.with_more(Found(set_aside=tuple(SetAside(path, reason, is_doubtful=True) for path in lone)))
+
+
+def _left_out(path: Path, reason: str) -> Found:
+    return Found(set_aside=(SetAside(path, reason),))
 
 
 def _with_missing_masks(images: Sequence[DeliveredImage]) -> list[DeliveredImage]:

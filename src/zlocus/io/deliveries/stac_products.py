@@ -16,11 +16,12 @@ from zlocus.core.quoting import quoted
 from zlocus.core.scene import Acquisition
 from zlocus.io.archives import is_archived
 from zlocus.io.cameras.rpc import find_sidecar
-from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum
+from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, Spectrum, found_in_products
 from zlocus.io.image_acquisition import acquisition_from, sun_direction, time_in
 from zlocus.io.safe_documents import read_json
 from zlocus.io.stored_files import file_exists
 
+STAC_SUFFIXES = (".json", ".geojson")
 MAX_ITEMS, MAX_DEPTH = 10_000, 8
 PIXEL_MEDIA = ("image/tiff", "image/jp2", "application/x-nitf", "image/nitf", "image/vnd.stac.geotiff")
 PIXEL_SUFFIXES = (".tif", ".tiff", ".ntf", ".jp2", ".vrt")
@@ -34,26 +35,24 @@ ADVICE = "Copy the catalogue again from its source, with its images."
 
 
 def stac_products(files: Sequence[Path]) -> Found:
-    """The images of all STAC items among the files of a delivery.
-
-    Raises
-    ------
-    InputError
-        An item names a file that is missing, outside the delivery or on a server; a catalogue names an item that is.
-    """
-    images: list[DeliveredImage] = []
+    """The images of all STAC items among the files of a delivery. Catalogues among them are asked for what is
+    missing."""
     root = _common_folder(files)
-    for path in files:
-        if path.suffix.lower() in (".json", ".geojson"):
-            document = _document(path)
-            if document is not None and document.get("type") == "Feature":
-                images += _images(path, document, root)
-            elif document is not None:
-                for href in _links(document):
-                    # Published catalogues name their items by addresses; those beside them are found all the same.
-                    if "://" not in str(href):
-                        _named(path, href, root)
-    return Found(tuple(images))
+
+    def read(path: Path) -> Found:
+        document = _document(path)
+        if document is None:
+            return Found()
+        if document.get("type") == "Feature":
+            return Found(tuple(_images(path, document, root)))
+        for href in _links(document):
+            # Published catalogues name their items by addresses; those beside them are found all the same.
+            if "://" not in str(href):
+                _named(path, href, root)
+        return Found()
+
+    documents = [path for path in files if path.suffix.lower() in STAC_SUFFIXES]
+    return found_in_products(documents, read, lambda path: [path])
 
 
 def stac_input(path: Path) -> Found:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from zlocus.core.errors import ZlocusError, ZlocusWarning
+from zlocus.core.errors import ZlocusError, ZlocusNote, ZlocusWarning
 from zlocus.core.footprints import PairGeometry, ViewGeometry, check_overlap, pair_geometries, view_geometry
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
@@ -24,7 +24,7 @@ from zlocus.core.scene import Scene
 from zlocus.io.run_record import write_record
 from zlocus.io.scene_file import UsableViews, open_usable_views
 from zlocus.pipeline.doctor.advice import image_advice
-from zlocus.pipeline.doctor.findings import POOR, STOPS, Finding
+from zlocus.pipeline.doctor.findings import NOTE, POOR, STOPS, Finding
 from zlocus.pipeline.doctor.geometry import geometry_findings, shadow_findings
 from zlocus.pipeline.doctor.plan import plan_findings, run_plan
 from zlocus.pipeline.doctor.plane import plane_findings
@@ -55,8 +55,10 @@ class Findings:
             try:
                 yield
             finally:
-                ours = [each.message for each in caught if issubclass(each.category, ZlocusWarning)]
-                self.entries += [Finding(POOR, str(message)) for message in ours]
+                for each in caught:
+                    if issubclass(each.category, ZlocusWarning):
+                        level = NOTE if issubclass(each.category, ZlocusNote) else POOR
+                        self.entries.append(Finding(level, str(each.message)))
 
     def tried(self, step: Callable[[], T], about: tuple[str, ...] = ()) -> T | None:
         """The result of a step; None where it fails, as a run would: its message becomes a finding."""
