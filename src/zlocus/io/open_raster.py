@@ -168,11 +168,12 @@ def _dataset(path: Path, name: str, is_list: bool) -> rasterio.DatasetReader:
 
 
 def _tile_header(path: Path) -> TileHeader:
-    """The size and the bands of a tile of a product."""
+    """The size and the bands of a tile of a product, which is checked to be complete."""
     first = first_bytes(path).lstrip()
     if not first or is_virtual(first) or first.startswith((b"<", b"{", *ARCHIVES)):
         raise InputError(f"The tile {path} is empty or holds no pixels itself. Copy the product again.")
     with open_raster(path, "tile") as source:
+        check_complete(source, path)
         return TileHeader(
             source.shape,
             source.dtypes[0],

@@ -24,7 +24,7 @@ from rpc_fixtures import write_image
 from zlocus.core.errors import InputError
 from zlocus.io.archives import SMALL_BYTES
 from zlocus.io.deliveries.delivery import describe, open_delivery
-from zlocus.io.scene_file import open_usable_views
+from zlocus.io.scene_file import open_scene, open_usable_views
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -164,6 +164,16 @@ def test_a_tile_that_is_a_list_of_other_files(taken, tmp_path):
     root = dimap_delivery(tmp_path / "d", taken)
     one(root, "IMG_*_P_*_R1C1.TIF").write_text('<VRTDataset rasterXSize="100" rasterYSize="70"></VRTDataset>')
     assert "holds no pixels itself" in refused(root)
+
+
+@pytest.mark.parametrize(
+    ("write", "tile"), [(dimap_delivery, "IMG_*_P_*R2C1.TIF"), (maxar_delivery, "*P1BS_R2C1*.TIF")]
+)
+def test_a_truncated_tile_is_named(taken, tmp_path, write, tile):
+    path = one(write(tmp_path / "d", taken), tile)
+    path.write_bytes(path.read_bytes()[:8000])
+    with pytest.raises(InputError, match=rf"{path.name} is truncated: it has 8000 bytes, and pixels of row \d+ on lie"):
+        open_scene([tmp_path / "d"])
 
 
 def test_entities_in_xml(taken, tmp_path):

@@ -310,8 +310,12 @@ def test_a_narrow_base(tmp_path):
 
 
 def test_images_along_one_line_stop_a_run(good, tmp_path):
-    same = changed(good["nadir"], tmp_path, lambda p: p[:, ::1])
-    twin = same.rename(tmp_path / "twin.tif")
+    part = changed(good["nadir"], tmp_path, lambda p: p[1:])
+    twin = part.rename(tmp_path / "twin.tif")
+    with rasterio.open(twin, "r+") as file:
+        rpc = file.rpcs
+        rpc.line_off -= 1
+        file.rpcs = rpc
     status, _, report = doctor(tmp_path / "out", good["nadir"], twin, "--heights", 25, 80)
     assert status == 2
     assert any("same line" in s and "show no heights" in s for s in sentences(report, "stops"))
@@ -357,6 +361,8 @@ def test_an_image_that_cannot_be_used_does_not_hide_the_others(good, tmp_path, f
     assert "missing.tif" in told[1]
     assert all(f"- {sentence}" in text.splitlines() for sentence in told)
     assert list(report["refused"]) == [faulty.stem, "missing"]
+    mend = f"Mend {faulty.stem}, missing before you look for other images: see above what is wrong."
+    assert report["advice"] == ["Keep fore, nadir.", mend]
     assert [view["n_ties"] > 100 for view in report["views"].values()] == [True, True]
     assert drawn(tmp_path / "out") == ["fore", "nadir"]
 

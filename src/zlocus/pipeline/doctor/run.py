@@ -140,7 +140,8 @@ def examined(
         findings.entries += geometry_findings(names, geometry, pairs) + shadow_findings(scene.views)
         if ties is not None:
             findings.entries += tie_findings(names, ties.orientation, pairs, config.orientation)
-            advice = image_advice(names, ties.orientation, pairs, config.selection)
+            unusable = [each.name for each in usable_views.refused]
+            advice = image_advice(names, ties.orientation, pairs, config.selection, unusable)
             findings.entries += plane_findings(corrected, request.inputs, ties.orientation)
             plan = planned(request, config, corrected, ties, geometry, findings)
     return Diagnosis(
