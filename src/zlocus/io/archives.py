@@ -22,6 +22,8 @@ from zlocus.core.quoting import quoted
 
 ZIP_SUFFIXES, TAR_SUFFIXES = (".zip",), (".tar", ".tgz", ".tar.gz")
 ZIP_SYSTEM, TAR_SYSTEM = "vsizip", "vsitar"
+# How files of each kind begin; the last one is the mark of an empty ZIP.
+ZIP_MAGIC, GZIP_MAGIC, TAR_MAGIC, TAR_MAGIC_AT = (b"PK\x03\x04", b"PK\x05\x06"), b"\x1f\x8b", b"ustar", 257
 # A delivery of a whole country in tiles has ten thousand files.
 MAX_MEMBERS = 100_000
 # Images shrink by a factor of two to ten, and empty ones by some hundreds. Members that would take less than
@@ -185,8 +187,11 @@ def _members(archive: Path, size: int, time_ns: int) -> tuple[Member, ...]:
     """See `members`. size, time_ns : of the file, so that a changed archive is read again."""
     del time_ns
     try:
+        _check_kind(archive, size)
         found = _zip_members(archive) if archive.name.lower().endswith(ZIP_SUFFIXES) else _tar_members(archive)
     except (OSError, EOFError, zlib.error, zipfile.BadZipFile, tarfile.TarError, ValueError) as error:
+        if isinstance(error, EOFError) or str(error) == "unexpected end of data":
+            raise InputError(f"{archive} is cut short: it ends within one of its files. {ADVICE}") from error
         why = str(error).partition("\n")[0].rstrip(".:")
         raise InputError(f"{archive} cannot be read as an archive: {why}. {ADVICE}") from error
     _check_size(archive, sum(each.n_bytes for each in found), size)
@@ -194,6 +199,25 @@ def _members(archive: Path, size: int, time_ns: int) -> tuple[Member, ...]:
         if number and each.name == found[number - 1].name:
             raise InputError(f"{archive} holds {quoted(each.name)} twice. {ADVICE}")
     return tuple(found)
+
+
+def _check_kind(archive: Path, size: int) -> None:
+    """Refuse a file whose content is not what its name says, or that is cut short, and say so."""
+    if size == 0:
+        raise InputError(f"{archive} is empty: it has no bytes. {ADVICE}")
+    with archive.open("rb") as file:
+        head = file.read(TAR_MAGIC_AT + len(TAR_MAGIC))
+    is_named_zip = archive.name.lower().endswith(ZIP_SUFFIXES)
+    kinds = {
+        "ZIP": head.startswith(ZIP_MAGIC), "TAR": head[TAR_MAGIC_AT:] == TAR_MAGIC,
+        "compressed TAR": head.startswith(GZIP_MAGIC),
+    }  # fmt: skip
+    kind = next((kind for kind, is_it in kinds.items() if is_it), None)
+    if kind is not None and (kind == "ZIP") != is_named_zip:
+        suffix = {"ZIP": ".zip", "TAR": ".tar"}.get(kind, ".tar.gz")
+        raise InputError(f"{archive} is a {kind} archive by its content. Rename it, so that its name ends in {suffix}.")
+    if kind == "ZIP" and not zipfile.is_zipfile(archive):
+        raise InputError(f"{archive} is cut short: the list of its files, at the end of a ZIP, is missing. {ADVICE}")
 
 
 def _zip_members(archive: Path) -> list[Member]:

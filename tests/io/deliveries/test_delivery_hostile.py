@@ -106,7 +106,7 @@ def test_bombs(tmp_path):
 
 
 def test_damaged_archives(tmp_path):
-    (tmp_path / "d.zip").write_bytes(b"PK\x03\x04 no archive")
+    (tmp_path / "d.zip").write_bytes(b"PK no archive")
     assert "cannot be read as an archive" in refused(tmp_path / "d.zip")
     (tmp_path / "d.tgz").write_bytes(b"\x1f\x8b\x08\x00" + bytes(40))
     assert "cannot be read as an archive" in refused(tmp_path / "d.tgz")
@@ -128,7 +128,40 @@ def test_an_archive_in_an_archive_is_not_opened(taken, tmp_path):
     inner = zipped(dimap_delivery(tmp_path / "delivery", taken), tmp_path / "inner.zip")
     with zipfile.ZipFile(tmp_path / "d.zip", "w") as file:
         file.write(inner, "inner.zip")
-    assert "holds no image with a camera" in refused(tmp_path / "d.zip")
+    alone = f"{tmp_path / 'd.zip'} holds no image with a camera: inner.zip is an archive in it, which is not opened"
+    assert refused(tmp_path / "d.zip").startswith(alone)
+    # Beside an order it is a note.
+    inner.rename(tmp_path / "delivery" / "inner.zip")
+    (tmp_path / "delivery" / "other").symlink_to(tmp_path)
+    delivery = open_delivery(tmp_path / "delivery")
+    assert len(delivery.views) == 2
+    assert not delivery.is_doubtful
+    assert "inner.zip (is an archive in it" in describe(delivery)
+    assert "other (is a link to a folder" in describe(delivery)
+
+
+def test_an_archive_says_what_is_wrong_with_it(tmp_path):
+    (tmp_path / "image.tif").write_bytes(bytes(range(256)) * 40)
+    with zipfile.ZipFile(tmp_path / "good.zip", "w") as file:
+        file.write(tmp_path / "image.tif", "image.tif")
+    for name, mode in (("good.tar", "w"), ("good.tgz", "w:gz")):
+        with tarfile.open(tmp_path / name, mode) as file:
+            file.add(tmp_path / "image.tif", "image.tif")
+    contents = {name: (tmp_path / f"good.{name}").read_bytes() for name in ("zip", "tar", "tgz")}
+    for name, content, says in (
+        ("a.zip", contents["tar"], "is a TAR archive by its content. Rename it, so that its name ends in .tar."),
+        ("b.zip", contents["tgz"], "is a compressed TAR archive by its content. Rename it"),
+        ("a.tar", contents["zip"], "is a ZIP archive by its content. Rename it, so that its name ends in .zip."),
+        ("c.zip", contents["zip"][:5000], "is cut short: the list of its files"),
+        ("c.tar", contents["tar"][:5000], "is cut short: it ends within one of its files"),
+        ("c.tgz", contents["tgz"][:-40], "is cut short: it ends within one of its files"),
+        ("d.zip", b"", "is empty: it has no bytes"),
+    ):  # fmt: skip
+        (tmp_path / name).write_bytes(content)
+        assert f"{tmp_path / name} {says}" in refused(tmp_path / name)
+    with zipfile.ZipFile(tmp_path / "e.zip", "w"):
+        pass
+    assert f"{tmp_path / 'e.zip'} is empty: it holds no files." in refused(tmp_path / "e.zip")
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from zlocus.io.deliveries.dimap_products import dimap_input, dimap_products
 from zlocus.io.deliveries.gaofen_products import gaofen_products
 from zlocus.io.deliveries.geoeye_products import geoeye_products
 from zlocus.io.deliveries.ground_agreement import are_of_one_pass, contradictions
-from zlocus.io.deliveries.listing import files_in
+from zlocus.io.deliveries.listing import files_in, linked_folders
 from zlocus.io.deliveries.maxar_products import maxar_input, maxar_products
 from zlocus.io.deliveries.pairing import ColourPartner, colour_partner
 from zlocus.io.deliveries.plain_images import plain_images
@@ -40,6 +40,8 @@ READERS: tuple[Reader, ...] = (
     stac_products, dimap_products, maxar_products, geoeye_products, planet_products, gaofen_products, plain_images,
 )  # fmt: skip
 STAC_SUFFIXES = (".json", ".geojson")
+ARCHIVE_INSIDE = "is an archive in it, which is not opened: unpack it, or give it as an input of its own"
+LINKED_FOLDER = "is a link to a folder, which is not followed: give that folder as an input of its own"
 # Files that a note names at most for one reason.
 MAX_NAMED = 3
 
@@ -167,7 +169,9 @@ def _nothing_in(path: Path, aside: Sequence[SetAside]) -> str:
     """The sentence on a delivery without an image."""
     reasons = [f"{each.path.name} {each.reason}" for each in aside]
     why = f": {reasons[0]}" if reasons else ""
-    return f"{path} holds no image with a camera{why}. Give the folder that the vendor delivered."
+    # Some reasons say themselves what to do.
+    advice = "" if ": " in why.removeprefix(": ") else " Give the folder that the vendor delivered."
+    return f"{path} holds no image with a camera{why}.{advice}"
 
 
 def _partners(images: Sequence[DeliveredImage], all_images: Sequence[DeliveredImage]) -> dict[str, ColourPartner]:
@@ -190,11 +194,16 @@ def _found(path: Path) -> Found:
     if is_tile_index(path):
         return dimap_input(path)
     files = files_in(path_in_archive(path) if is_archive(path) and path.is_file() else path)
+    linked = linked_folders(path) if path.is_dir() else ()
+    if not files and not linked:
+        raise InputError(f"{path} is empty: it holds no files. Copy it again from its source, or check the path.")
     found, left = Found(), list(files)
     for reader in READERS:
         more = reader(left) if left else Found()
         found = found.with_more(more)
         left = [each for each in left if each not in more.claimed]
+    inside = [SetAside(each, ARCHIVE_INSIDE) for each in left if is_archive(each)]
+    found = found.with_more(Found(set_aside=(*inside, *(SetAside(each, LINKED_FOLDER) for each in linked))))
     return replace(found, table=find_table(files))
 
 

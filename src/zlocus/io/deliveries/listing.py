@@ -34,6 +34,15 @@ def files_in(path: Path) -> tuple[Path, ...]:
     return tuple(each for each in found if path == archive or each.is_relative_to(path))
 
 
+def linked_folders(folder: Path) -> tuple[Path, ...]:
+    """The links to folders in a folder and all folders in it, in order of their names. Hidden ones are left out."""
+    found: list[Path] = []
+    for at, names, _ in os.walk(folder):
+        names[:] = [name for name in names if not _is_hidden([name])]
+        found += [link for name in names if (link := Path(at) / name).is_symlink()]
+    return tuple(sorted(found))
+
+
 def _in_folder(folder: Path) -> tuple[Path, ...]:
     def refuse(error: OSError) -> None:
         raise InputError(f"The folder {error.filename} cannot be read: {error.strerror}. Check who may read it.")
