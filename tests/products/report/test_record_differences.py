@@ -76,6 +76,13 @@ def test_inputs_that_differ(run, other):
     assert [row.meaning for row in records.input_differences(run, other)] == ["only in A", "only in B"]
 
 
+def test_a_second_copy_of_an_input_is_one_more(run, other):
+    run["inputs"] = [{"path": "order/a.tif", "sha256": "1"}]
+    other["inputs"] = [{"path": f"{copy}/a.tif", "sha256": "1"} for copy in ("first", "second")]
+    assert [(row.name, row.meaning) for row in records.input_differences(run, other)] == [("second/a.tif", "only in B")]
+    assert [(row.name, row.meaning) for row in records.input_differences(other, run)] == [("second/a.tif", "only in A")]
+
+
 def test_cameras_are_sorted_by_their_difference(run, other):
     other["orientation"]["views"]["b"]["shift_px"] = [4.0, 2.0]
     other["orientation"]["views"]["c"] = other["orientation"]["views"]["a"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -88,7 +89,8 @@ def _differing(first: Mapping[str, Any], second: Mapping[str, Any], meanings: Ma
 
 
 def input_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[ValueRow]:
-    """Input files that only one run has, or whose content differs. A file that was moved is the same."""
+    """Input files that only one run has, or whose content differs. A file that was moved is the same, and so is each of
+    several copies for which the other run has one as well."""
     mine, theirs = ({each["path"]: each["sha256"] for each in run["inputs"]} for run in (first, second))
     rows = [
         ValueRow(path, mine[path] or "not read completely", theirs[path] or "not read completely", "other content")
@@ -96,8 +98,11 @@ def input_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> li
         if path in theirs and mine[path] != theirs[path]
     ]
     for one, other, texts in ((mine, theirs, ("yes", "no", "only in A")), (theirs, mine, ("no", "yes", "only in B"))):
-        elsewhere = {other[path] for path in other if path not in one and other[path]}
-        rows += [ValueRow(path, *texts) for path in one if path not in other and one[path] not in elsewhere]
+        elsewhere = Counter(other[path] for path in other if path not in one and other[path])
+        for path in (path for path in one if path not in other):
+            elsewhere[one[path]] -= 1
+            if elsewhere[one[path]] < 0:
+                rows.append(ValueRow(path, *texts))
     return rows
 
 
