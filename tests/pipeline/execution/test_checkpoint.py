@@ -241,6 +241,16 @@ def test_differences_by_hand():
     assert "..." in difference({"a": "x" * 100}, {"a": ""})
 
 
+def test_an_input_seen_from_another_folder_is_the_same():
+    before = {"inputs": {"order/a.TIL": [10, 5], "order/b.TIL": [11, 6]}, "z": 1}
+    now = {"inputs": {"../order/a.TIL": [10, 5], "../order/b.TIL": [11, 6]}, "z": 1}
+    assert difference(before, now) == ""
+    assert difference(before, now | {"z": 2}) == "z was 1 there and is 2 now"
+    changed = now | {"inputs": {"../order/a.TIL": [10, 7], "../order/b.TIL": [11, 6]}}
+    assert difference(before, changed) == "order/a.TIL is missing"
+    assert difference(before, {"inputs": {}, "z": 1}) == "order/a.TIL is missing"
+
+
 @pytest.mark.parametrize(
     ("n", "says"),
     [(0, "No tile was finished yet"), (1, "The one finished tile is kept"), (3, "The 3 finished tiles are kept")],

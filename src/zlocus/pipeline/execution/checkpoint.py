@@ -302,11 +302,23 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = 
         if one == other:
             continue
         if isinstance(one, Mapping) and isinstance(other, Mapping):
-            return difference(one, other, f"{prefix}{name}.")
+            differs = difference(_as_named(one, other) if name == "inputs" else one, other, f"{prefix}{name}.")
+            if differs:
+                return differs
+            continue
         if prefix == "inputs.":
             return f"{name} has changed since" if one and other else f"{name} is {'new' if other else 'missing'}"
         return f"{_named(prefix, name)} was {_shown(one)} there and is {_shown(other)} now"
     return ""
+
+
+def _as_named(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """The input files of a key with the paths of another one. A file that has another path there, seen from another
+    folder, is the same where its name, size and time of change are."""
+    free = {(Path(name).name, str(state)): name for name, state in now.items() if name not in before and state}
+    return {
+        name if name in now else free.pop((Path(name).name, str(state)), name): state for name, state in before.items()
+    }
 
 
 def _named(prefix: str, name: str) -> str:
