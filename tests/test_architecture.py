@@ -208,6 +208,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "QuickTies": ("ties",),
     "RollingShutterEntry": ("rolling_shutter",),
     "RefinedTies": ("ties",),
+    "RefusedProduct": ("refused", "refused_products"),
     "RefusedView": ("refused",),
     "RegularTimes": ("times",),
     "RpcCoefficients": ("rpc",),

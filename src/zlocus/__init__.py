@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         StoppedError,
         TileError,
         ZlocusError,
+        ZlocusNote,
         ZlocusWarning,
     )
     from zlocus.core.notebook_progress import NotebookProgress
@@ -67,15 +68,15 @@ __all__ = [
     "Evaluation", "GeometryError", "InputError", "LineProgress", "LocusStack", "NotebookProgress", "Orientation",
     "OrientationOptions", "OutputError", "PlaneOptions", "ProductOptions", "PyramidOptions", "Quality",
     "RefineOptions", "RunConfig", "Scene", "SelectionOptions", "SemiGlobalHeights", "SemiGlobalOptions",
-    "SilentProgress", "StoppedError", "Ties", "TileError", "WaterOptions", "ZlocusError", "ZlocusWarning",
-    "__version__", "evaluate", "find_ties", "is_empty", "locus_stack", "match", "ncc_cost", "open_scene",
-    "open_surface", "orient", "read_config", "semiglobal", "true_ortho",
+    "SilentProgress", "StoppedError", "Ties", "TileError", "WaterOptions", "ZlocusError", "ZlocusNote",
+    "ZlocusWarning", "__version__", "evaluate", "find_ties", "is_empty", "locus_stack", "match", "ncc_cost",
+    "open_scene", "open_surface", "orient", "read_config", "semiglobal", "true_ortho",
 ]  # fmt: skip
 # Modules from which names are taken when they are asked for; all other names are those of `zlocus.api`.
 _MODULES = {
     "zlocus.core.errors": (
         "ConfigError", "CoverageError", "GeometryError", "InputError", "OutputError", "StoppedError", "TileError",
-        "ZlocusError", "ZlocusWarning",
+        "ZlocusError", "ZlocusNote", "ZlocusWarning",
     ),
     "zlocus.core.notebook_progress": ("NotebookProgress",),
     "zlocus.core.options": ("RunConfig", *(name for name in __all__ if name.endswith("Options"))),

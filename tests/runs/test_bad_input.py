@@ -224,7 +224,10 @@ def test_an_image_of_noise_is_not_matched(refused, good_pair, heights):
 def test_two_images_from_the_same_direction(refused, good_pair):
     pixels, rpc = pixels_and_rpc(good_pair[0])
     write_image(Path("twin.tif"), np.roll(pixels, 1), None, rpcs=rpc)
-    assert "same line" in refused(good_pair[0], "twin.tif", "--heights", 20, 90)
+    assert "have the identical RPC" in refused(good_pair[0], "twin.tif", "--heights", 20, 90)
+    rpc.line_off -= 1
+    write_image(Path("part.tif"), pixels[1:], None, rpcs=rpc)
+    assert "same line" in refused(good_pair[0], "part.tif", "--heights", 20, 90)
 
 
 def test_unknown_configuration_keys(refused, good_pair):

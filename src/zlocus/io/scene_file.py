@@ -361,10 +361,10 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[Refu
     if scene_files:
         scene_input = _from_scene_file(scene_files[0], crs, refused)
     else:
-        products: list[RefusedProduct] | None = None if refused is None else []
-        scene_input = _SceneInput(entries_of(paths, products), Path(), crs)
+        refused_products: list[RefusedProduct] | None = None if refused is None else []
+        scene_input = _SceneInput(entries_of(paths, refused_products), Path(), crs)
         if refused is not None:
-            refused += [RefusedView(each.path.stem, each.path, each.reason) for each in products or ()]
+            refused += [RefusedView(each.path.stem, each.path, each.reason) for each in refused_products or ()]
     if scene_input.crs is not None and not is_local(scene_input.crs):
         scene_input = replace(scene_input, crs=checked_crs(scene_input.crs))
     _check_distinct([entry.path for entry in scene_input.entries])

@@ -24,22 +24,22 @@ class ImageRpc:
     rpc: RpcCoefficients
 
 
-def shared_rpcs(images: Iterable[ImageRpc], products: bool = False) -> list[tuple[ImageRpc, ImageRpc]]:
+def shared_rpcs(image_rpcs: Iterable[ImageRpc], products: bool = False) -> list[tuple[ImageRpc, ImageRpc]]:
     """The pairs of images that have the identical RPC.
 
     products : whether some may be products of one exposure, such as a panchromatic and a pansharpened image; then only
     those of different exposures or sizes are found.
     """
     by_rpc: dict[RpcCoefficients, list[ImageRpc]] = {}
-    for each in images:
-        by_rpc.setdefault(each.rpc, []).append(each)
+    for image_rpc in image_rpcs:
+        by_rpc.setdefault(image_rpc.rpc, []).append(image_rpc)
     pairs = [pair for alike in by_rpc.values() for pair in itertools.combinations(alike, 2)]
-    return [(one, other) for one, other in pairs if not (products and _are_of_one_exposure(one, other))]
+    return [pair for pair in pairs if not (products and _are_of_one_exposure(*pair))]
 
 
-def _are_of_one_exposure(one: ImageRpc, other: ImageRpc) -> bool:
-    first, second = one.acquisition.time, other.acquisition.time
-    if one.shape != other.shape or first is None or second is None:
+def _are_of_one_exposure(image_rpc_a: ImageRpc, image_rpc_b: ImageRpc) -> bool:
+    first, second = image_rpc_a.acquisition.time, image_rpc_b.acquisition.time
+    if image_rpc_a.shape != image_rpc_b.shape or first is None or second is None:
         return False
     return abs((first - second).total_seconds()) <= SAME_EXPOSURE_SECONDS
 

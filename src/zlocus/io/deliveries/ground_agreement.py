@@ -67,24 +67,26 @@ def _image_rpc(image: DeliveredImage) -> ImageRpc | None:
         return None
 
 
-def are_of_one_pass(one: DeliveredImage, other: DeliveredImage) -> bool:
+def are_of_one_pass(image_a: DeliveredImage, image_b: DeliveredImage) -> bool:
     """Whether one satellite took both within `MAX_SECONDS`, as far as that is known."""
-    first, second = one.acquisition, other.acquisition
+    first, second = image_a.acquisition, image_b.acquisition
     if first.time is None or second.time is None or first.satellite != second.satellite:
         return False
     return abs((first.time - second.time).total_seconds()) <= MAX_SECONDS
 
 
-def _divergence(pan: ImageRpc, colour: ImageRpc) -> float | None:
+def _divergence(image_rpc_a: ImageRpc, image_rpc_b: ImageRpc) -> float | None:
     """By how many metres per metre of height the rays of common pixels diverge, the median; None where the images share
     too little ground."""
-    first, second = (RpcModel(each.rpc, CRS.from_epsg(4978)) for each in (pan, colour))
-    row, col = (np.linspace(0.0, side - 1.0, N_POINTS) for side in pan.shape)
+    first, second = (RpcModel(each.rpc, CRS.from_epsg(4978)) for each in (image_rpc_a, image_rpc_b))
+    row, col = (np.linspace(0.0, side - 1.0, N_POINTS) for side in image_rpc_a.shape)
     xy = np.stack(np.meshgrid(col, row), axis=-1).reshape(-1, 2)
-    low, high = (pan.rpc.height_off + relative * pan.rpc.height_scale for relative in RELATIVE_HEIGHTS[::2])
+    low, high = (
+        image_rpc_a.rpc.height_off + relative * image_rpc_a.rpc.height_scale for relative in RELATIVE_HEIGHTS[::2]
+    )
     lon, lat = first.geographic_from_image(xy, np.full(len(xy), low))
     at = second.image_from_geographic(lon, lat, np.full(len(xy), low))
-    inside = ((at > -0.5) & (at < np.array(colour.shape)[::-1] - 0.5)).all(axis=1)
+    inside = ((at > -0.5) & (at < np.array(image_rpc_b.shape)[::-1] - 0.5)).all(axis=1)
     if inside.mean() < MIN_COMMON:
         return None
     z = np.full(int(inside.sum()), high)
