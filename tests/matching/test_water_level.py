@@ -65,7 +65,7 @@ def test_a_precise_height_counts_more():
 def test_still_water_with_texture_has_its_median():
     inside = LEVEL_M + np.array([-0.2, 0.0, 0.2] * 200)
     found = water_level(heights(np.full(200, LEVEL_M + 0.5), inside=inside), OPTIONS)
-    assert (found.source, found.n_used) == ("inside", 600)
+    assert (found.source, found.n_used, found.inside_share) == ("inside", 600, 0.6)
     assert found.height_m == pytest.approx(LEVEL_M, abs=EXACT_M)
     assert found.sigma_m == pytest.approx(1.4826 * 0.2, abs=EXACT_M)
     # Of moving water a small share is confident by chance, and does not count.

@@ -6,13 +6,14 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyogrio.raw
 import pytest
 import rasterio
 import shapely
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from rasterio.features import shapes
 from typer.testing import CliRunner
 
@@ -20,10 +21,17 @@ from grid_input_files import write_water
 from interrupted_runs import command
 from rendered_scenes import CENTRE, SMALL_TILES, read, run
 from zlocus.cli.app import app
-from zlocus.core.errors import OutputError
+from zlocus.core.errors import InputError, OutputError
+from zlocus.core.height_range import HeightRange
 from zlocus.core.options import ProductOptions
+from zlocus.core.progress import KeptNotes
+from zlocus.io.vertical import named_vertical_datum
+from zlocus.io.water_polygons import WaterPolygons
 from zlocus.matching.quality import Quality
+from zlocus.matching.water_level import WaterLevel
+from zlocus.pipeline.water import far_levels, note_water
 from zlocus.products.rasters import WaterKind
+from zlocus.products.water import LevelledSurface, WaterFound
 from zlocus.synthetic.files import render_scene
 from zlocus.synthetic.scenes import trouble_spec
 
@@ -36,6 +44,7 @@ LAKE = shapely.Polygon(
 )
 POND, FAR = shapely.box(X + 14, Y + 3, X + 20, Y + 9), shapely.box(X + 5000, Y, X + 5010, Y + 10)
 POND_M = 51.25
+UTM, ELLIPSOID = CRS.from_epsg(32632), named_vertical_datum("ellipsoid")
 # The acceptance of this project: a lake is level within this, against the truth of a rendered scene.
 LEVEL_M = 0.05
 NO_REPORT = ("--crs", "EPSG:32632", "--resolution", "0.5", "--no-report", "--products", "none")
@@ -198,6 +207,59 @@ def test_wrong_polygons_are_one_sentence_before_matching(zl, images, tmp_path, c
     assert said in " ".join(done.stderr.splitlines()[-1].split())
     assert "Matching" not in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def of_level(level_m):
+    return WaterPolygons(Path("w.gpkg"), np.array([POND], object), ("polygon 1",), np.array([level_m]))
+
+
+@pytest.mark.parametrize(("level_m", "geoid_m"), [(10.0, 0.0), (60.0, 0.0), (np.nan, 0.0), (-35.0, 45.0)])
+def test_levels_within_the_searched_heights_are_not_doubted(level_m, geoid_m):
+    datum = SimpleNamespace(undulation=lambda xy, crs: np.full(len(xy), geoid_m))
+    assert far_levels(of_level(level_m), HeightRange((20.0, 50.0), (10.0, 60.0)), UTM, datum) == []
+
+
+@pytest.mark.parametrize("level_m", [9.0, -39.0, 109.0])
+def test_levels_beside_the_searched_heights_are_said(level_m):
+    (said,) = far_levels(of_level(level_m), HeightRange((20.0, 50.0), (10.0, 60.0)), UTM, ELLIPSOID)
+    assert said.startswith(f"The level {level_m:.2f} m of polygon 1 in w.gpkg is outside the heights where the ground ")
+    assert "is looked for, 10.0 to 60.0 m. Check" in said
+
+
+@pytest.mark.parametrize("level_m", [-41.0, 111.0, 4850.0])
+def test_levels_far_from_the_searched_heights_are_refused(level_m):
+    """Further than the searched heights are wide."""
+    with pytest.raises(InputError, match=rf"The level {level_m:.2f} m .*, 10\.0 to 60\.0 m\. Correct the level"):
+        far_levels(of_level(level_m), HeightRange((20.0, 50.0), (10.0, 60.0)), UTM, ELLIPSOID)
+
+
+def said_of(water_found, level_water=False):
+    progress = KeptNotes()
+    note_water(water_found, SimpleNamespace(level_water=level_water), progress)
+    return "\n".join(progress.sentences)
+
+
+@pytest.mark.parametrize(
+    ("level", "said"),
+    [
+        (WaterLevel(5.0, 2.9, "inside", 90, 0.9), "Matched like land, which water is not: polygon 1 (over 90 %, with a "
+                                                  "relief of 2.9 m)."),
+        (WaterLevel(5.0, 2.9, "rim", 90), "whose level may be too high: polygon 1 (by 2.9 m)."),
+        (WaterLevel(5.0, 0.2, "inside", 90, 0.9), None),
+        (WaterLevel(5.0, np.nan, "attribute", 0), None),
+    ],
+)  # fmt: skip
+def test_doubtful_levels_are_said_in_the_log_and_recorded(level, said):
+    water_found = WaterFound([LevelledSurface("polygon 1", WaterKind.LEVELLED, level, 100)])
+    log, recorded = said_of(water_found), water_found.as_dict()["doubts"]
+    assert "Water levelled: polygon 1 at 5.00 m." in log
+    assert len(recorded) == (said is not None)
+    assert all(said in sentence and sentence in log for sentence in recorded)
+
+
+def test_looking_for_water_where_there_is_none_is_said():
+    assert "--level-water levels nothing" in said_of(WaterFound(), level_water=True)
+    assert "levels nothing" not in said_of(WaterFound(n_possible=1), level_water=True) + said_of(WaterFound())
 
 
 def test_a_level_without_polygons_is_refused(zl, images, tmp_path):

@@ -9,6 +9,7 @@ different shores.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -52,13 +53,15 @@ class WaterLevel:
     """The level of a water surface.
 
     height_m : NaN where it is not known; sigma_m : standard deviation, NaN where it is not known; source : attribute,
-    rim or inside; n_used : number of cells whose heights were used.
+    rim or inside; n_used : number of cells whose heights were used; inside_share : of the cells away from the shore,
+    the share that has confident heights, NaN where the level does not come from these.
     """
 
     height_m: float
     sigma_m: float
     source: str
     n_used: int
+    inside_share: float = math.nan
 
 
 def water_level(
@@ -73,7 +76,8 @@ def water_level(
     n = len(heights.inside)
     if n >= options.min_shore_cells and n >= options.min_inside_share * heights.n_inside:
         middle = float(np.median(heights.inside))
-        return WaterLevel(middle, DEVIATION_PER_MAD * float(np.median(np.abs(heights.inside - middle))), "inside", n)
+        relief = DEVIATION_PER_MAD * float(np.median(np.abs(heights.inside - middle)))
+        return WaterLevel(middle, relief, "inside", n, n / heights.n_inside)
     if len(heights.shore) < options.min_shore_cells:
         return None
     level, next_lowest = (weighted_quantile(heights.shore, heights.shore_sigma, each) for each in (share, 2.0 * share))

@@ -57,7 +57,7 @@ from zlocus.pipeline.surface_products import (
 )
 from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
-from zlocus.pipeline.water import note_water, water_on_grid
+from zlocus.pipeline.water import far_levels, note_water, water_on_grid
 from zlocus.products.derived import check_derived
 from zlocus.products.report.file_names import RECORD, REPORT
 from zlocus.products.water import level_water
@@ -224,9 +224,10 @@ def prepare_surface(
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
-        water_polygons = (
-            None if run.water_polygons is None else water_on_grid(run.water_polygons, setup.grid.geobox, progress)
-        )
+        water_polygons = run.water_polygons
+        if water_polygons is not None:
+            water_polygons = water_on_grid(water_polygons, setup.grid.geobox, progress)
+            far_levels(water_polygons, setup.height_range, setup.scene.crs, opened_inputs.vertical_datum)
     job, digest = tile_job(request, setup, config, run.polygons, plan), digest_of(setup.match_scene, orientation)
     share = seen_share_of_run(setup, run.polygons, bool(request.bounds or request.like))
     if sentence := seen_sentence(share, "about "):
@@ -260,6 +261,10 @@ def write_rasters(
             rasters, setup.grid.geobox, prepared_surface.water_polygons, request.level_water,
             prepared_surface.config.water,
         )  # fmt: skip
+        if prepared_surface.water_polygons is not None:
+            water_found.doubts += far_levels(
+                prepared_surface.water_polygons, setup.height_range, setup.scene.crs, prepared_surface.vertical_datum
+            )
         tally.add_water(water_found)
         note_water(water_found, request, progress)
         # A terrain model that fills gaps was read again.

@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from odc.geo.geobox import GeoBox
+from pyproj import CRS
 
 from zlocus.core.errors import InputError
+from zlocus.core.height_range import HeightRange
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DsmRequest
+from zlocus.io.vertical import VerticalDatum
 from zlocus.io.water_polygons import WaterPolygons
 from zlocus.products.water import WaterFound, without_cells
 
 # A message names at most this many water surfaces.
 MAX_NAMED = 3
+# A given level is refused where it is further outside the searched heights than these are wide, at least this, m.
+MIN_MARGIN_M = 50.0
 # A level is said to be uncertain where its standard deviation is larger, m.
 UNCERTAIN_M = 0.25
 
@@ -40,31 +46,81 @@ def water_on_grid(water_polygons: WaterPolygons, geobox: GeoBox, progress: Progr
     return water_polygons.only(np.isin(water_polygons.names, beside, invert=True))
 
 
+def far_levels(
+    water_polygons: WaterPolygons, height_range: HeightRange, crs: CRS, vertical_datum: VerticalDatum
+) -> list[str]:  # fmt: skip
+    """Sentences about the given levels that are outside the searched heights of a run.
+
+    water_polygons : those on the grid; height_range : ellipsoidal; crs : of the grid; vertical_datum : of the levels.
+
+    Raises
+    ------
+    InputError
+        A level is further outside than the searched heights are wide, which no ground beside the water can explain.
+    """
+    levels = water_polygons.levels_m
+    if not np.isfinite(levels).any():
+        return []
+    xy = shapely.get_coordinates(shapely.point_on_surface(water_polygons.polygons))
+    low, high = (z - vertical_datum.undulation(xy, crs) for z in height_range.searched)
+    margin, sentences = np.maximum(high - low, MIN_MARGIN_M), list[str]()
+    for k in np.flatnonzero((levels < low) | (levels > high)):
+        said = (
+            f"The level {levels[k]:.2f} m of {water_polygons.names[k]} in {water_polygons.path} is outside the heights "
+            f"where the ground is looked for, {low[k]:.1f} to {high[k]:.1f} m"
+        )
+        if not low[k] - margin[k] <= levels[k] <= high[k] + margin[k]:
+            raise InputError(f"{said}. Correct the level, or name its vertical datum by --vertical.")
+        sentences.append(f"{said}. Check the level and its vertical datum (--vertical).")
+    return sentences
+
+
 def note_water(water_found: WaterFound, request: DsmRequest, progress: Progress) -> None:
-    """Say which water surfaces were levelled, which keep their heights, and which levels are uncertain."""
-    if water_found.levelled_surfaces:
-        said = [f"{each.name} at {each.level.height_m:.2f} m" for each in water_found.levelled_surfaces]
+    """Say which water surfaces were levelled, which keep their heights, and which levels are doubtful."""
+    levelled = water_found.levelled_surfaces
+    if levelled:
+        said = [f"{each.name} at {each.level.height_m:.2f} m" for each in levelled]
         progress.note(f"Water levelled: {_named(said)}.")
-    if water_found.left:
-        progress.note(
-            f"Too few heights at the shore tell the level of {_named(water_found.left)}, and the matched heights stay "
-            "there. Give levels by --water-level."
-        )
-    uncertain = [
-        f"{each.name} (by {each.level.sigma_m:.1f} m)"
-        for each in water_found.levelled_surfaces
-        if each.level.sigma_m > UNCERTAIN_M  # NaN where it was given
-    ]
-    if uncertain:
-        progress.note(
-            f"The ground rises steeply from the water, whose level may be too high: {_named(uncertain)}. Give the "
-            "level by --water-level where it is known."
-        )
+    water_found.doubts += _doubts(water_found)
+    for sentence in water_found.doubts:
+        progress.note(sentence)
     if water_found.n_possible and not request.level_water:
         progress.note(
             f"Possible water in {water_found.n_possible} area{'s' if water_found.n_possible > 1 else ''} (3 in "
             "water.tif): the images agree at no height there. --water or --level-water levels it."
         )
+    if request.level_water and not water_found.n_possible:
+        progress.note(
+            "--level-water levels nothing: no area looks like water, dark, flat at its rim and without matches."
+        )
+
+
+def _doubts(water_found: WaterFound) -> list[str]:
+    """Sentences about water surfaces without a level, and about levels that the images tell badly."""
+    doubts = []
+    if water_found.left:
+        doubts.append(
+            f"Too few heights at the shore tell the level of {_named(water_found.left)}, and the matched heights stay "
+            "there. Give levels by --water-level."
+        )
+    found = [each for each in water_found.levelled_surfaces if each.level.sigma_m > UNCERTAIN_M]  # NaN where given
+    steep = [f"{each.name} (by {each.level.sigma_m:.1f} m)" for each in found if each.level.source != "inside"]
+    if steep:
+        doubts.append(
+            f"The ground rises steeply from the water, whose level may be too high: {_named(steep)}. Give the "
+            "level by --water-level where it is known."
+        )
+    land = [
+        f"{each.name} (over {100 * each.level.inside_share:.0f} %, with a relief of {each.level.sigma_m:.1f} m)"
+        for each in found
+        if each.level.source == "inside"
+    ]
+    if land:
+        doubts.append(
+            f"Matched like land, which water is not: {_named(land)}. Its median became the level; check the polygons "
+            "and their CRS."
+        )
+    return doubts
 
 
 def _named(names: Sequence[str]) -> str:

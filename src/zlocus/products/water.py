@@ -63,13 +63,14 @@ class WaterFound:
     """Water surfaces of a surface.
 
     levelled_surfaces : those that have a level now; left : names of those that keep their heights, because too few tell
-    a level; n_possible : number of areas of possible water. n_seen, n_matched : number of levelled cells that two
-    images see, and of those whose height was matched.
+    a level; n_possible : number of areas of possible water; doubts : sentences about levels that may be wrong. n_seen,
+    n_matched : number of levelled cells that two images see, and of those whose height was matched.
     """
 
     levelled_surfaces: list[LevelledSurface] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
     n_possible: int = 0
+    doubts: list[str] = field(default_factory=list)
     n_seen: int = 0
     n_matched: int = 0
 
@@ -77,7 +78,7 @@ class WaterFound:
         """The surfaces as run.json holds them."""
         return {
             "levelled": [each.as_dict() for each in self.levelled_surfaces], "left": self.left,
-            "possible": self.n_possible,
+            "possible": self.n_possible, "doubts": self.doubts,
         }  # fmt: skip
 
 

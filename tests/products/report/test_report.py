@@ -616,6 +616,7 @@ def test_the_summary_tells_levels_and_possible_water():
     assert words.what_is_water({"water": {"levelled": possible, "possible": 1}}) == (
         "1 water surface has one level, not matched heights: possible water 1 at 1.00 m."
     )
+    assert words.what_is_water({"water": {"possible": 0, "doubts": ["The level is odd."]}}) == "The level is odd."
     assert words.what_is_water({}) == ""
 
 

@@ -264,7 +264,7 @@ def what_is_missing(survey: Survey) -> str:
 
 
 def what_is_water(run: Mapping[str, Any]) -> str:
-    """Levels of the water surfaces, and whether more water is possible, in sentences; "" without any."""
+    """Levels of the water surfaces, whether more water is possible, and what is doubtful, in sentences; "" without."""
     water = run.get("water", {})
     levelled, n_possible, said = water.get("levelled", []), water.get("possible", 0), []
     if levelled:
@@ -276,7 +276,7 @@ def what_is_water(run: Mapping[str, Any]) -> str:
     if n_kept > 0:
         areas = "1 area" if n_kept == 1 else f"{n_kept} areas"
         said.append(f"Water is possible in {areas} (3 in water.tif), where the images agree at no height.")
-    return " ".join(said)
+    return " ".join([*said, *water.get("doubts", [])])
 
 
 def what_is_doubtful(survey: Survey) -> str:
