@@ -39,7 +39,7 @@ from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import write_finished
 from zlocus.pipeline.finished_run import Missing, make_missing, missing_products, whole_again
 from zlocus.pipeline.messages import note_orientation
-from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, open_run
+from zlocus.pipeline.open_run import OpenRun, check_polygons, known_ties, may_have_terrain, note_mask_beside, open_run
 from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.required_space import check_room
 from zlocus.pipeline.run_plan import Plan, planned, remember_run, said_before_orientation, timed_stages
@@ -224,6 +224,7 @@ def prepare_surface(
         setup = set_up_run(SetupRequest.of(request), opened_inputs, orientation, config, progress)
         tiles = plan_tiles(setup.grid.window, setup.match_scene.overlap_window, config.pyramid)
         plan = _checked_plan(request, config, run, setup, tiles)
+        note_mask_beside(request.mask, run.polygons.outside, setup.grid.geobox, progress)
         water_polygons = run.water_polygons
         if water_polygons is not None:
             water_polygons = water_on_grid(water_polygons, setup.grid.geobox, progress)

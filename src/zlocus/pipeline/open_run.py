@@ -6,9 +6,12 @@ Impossible runs are refused.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import shapely
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
 from zlocus.core.errors import GeometryError
@@ -141,4 +144,13 @@ def check_polygons(request: DsmRequest, setup: RunSetup, area: NDArray[Any] | No
     if not cells_inside(area, grid.geobox[row : row + shared.rows, col : col + shared.cols]).any():
         raise GeometryError(
             f"No cell of the ground that two images see lies inside {request.area}. Check the polygons and their CRS."
+        )
+
+
+def note_mask_beside(path: Path | None, mask: NDArray[Any] | None, geobox: GeoBox, progress: Progress) -> None:
+    """Say that no polygon of --mask reaches the grid. path, mask : file and polygons (n,), None without any."""
+    if mask is not None and not shapely.intersects(mask, shapely.box(*geobox.boundingbox.bbox)).any():
+        progress.note(
+            f"--mask {path} leaves nothing out, because its polygons lie outside the grid. Check the polygons and "
+            "their CRS."
         )

@@ -6,7 +6,7 @@ from pyproj import CRS, Transformer
 
 from mask_files import UTM, box, geojson, mask_of, whole
 from rpc_fixtures import satellite_rpc
-from zlocus.core.errors import InputError
+from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.io.crs import local_frame
 from zlocus.io.masks.ground_polygons import GroundView
 from zlocus.sensors.rpc import RpcModel
@@ -31,7 +31,8 @@ def test_polygons_are_seen_at_the_mean_height_or_the_one_that_is_given(tmp_path,
     expected = np.zeros(SHAPE, bool)
     expected[5:25, 10:20] = True
     np.testing.assert_array_equal(whole(mask_of(SHAPE, entry, rpc=RPC, mean_height=RPC.height_off)), expected)
-    other = whole(mask_of(SHAPE, entry | {"height": z + 100.0}, rpc=RPC, mean_height=RPC.height_off))
+    with pytest.warns(ZlocusWarning, match="because its polygons lie beside the image"):
+        other = whole(mask_of(SHAPE, entry | {"height": z + 100.0}, rpc=RPC, mean_height=RPC.height_off))
     assert (other != expected).any()
 
 
@@ -49,7 +50,13 @@ def test_a_country_and_a_polygon_that_crosses_itself(tmp_path):
 
 def test_elsewhere_nothing_is_masked_and_an_empty_file_is_a_clear_day(tmp_path):
     away = geojson(tmp_path / "m.geojson", [box(20.0, 50.0, 20.1, 50.1)])
-    assert not whole(mask_of(SHAPE, {"file": str(away)}, rpc=RPC, mean_height=450.0)).any()
+    with pytest.warns(
+        ZlocusWarning, match=r"m\.geojson covers no pixel of image\.tif, because its polygons lie beside"
+    ):
+        mask = mask_of(SHAPE, {"file": str(away)}, rpc=RPC, mean_height=450.0)
+    assert not whole(mask).any()
+    with pytest.warns(ZlocusWarning, match=r"m\.geojson covers every pixel of image\.tif"):
+        mask_of(SHAPE, {"file": str(away), "outside": True}, rpc=RPC, mean_height=450.0)
     assert not whole(mask_of(SHAPE, {"file": str(geojson(tmp_path / "e.geojson"))}, rpc=RPC, mean_height=450.0)).any()
 
 

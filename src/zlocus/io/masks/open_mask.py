@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from zlocus.core.errors import InputError
+from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.io.crs import file_crs
 from zlocus.io.masks.gml_masks import is_vendor_gml, read_gml_mask
 from zlocus.io.masks.ground_polygons import GroundView
@@ -59,18 +60,27 @@ def _files_beside(path: Path) -> list[Path]:
 def _open_part(entry: MaskEntry, path: Path, image: Path, ground_view: GroundView) -> MaskPart:
     is_vector = path.suffix.lower() in VECTOR_SUFFIXES
     if entry.kind in ("polygons", "gml") or (entry.kind is None and is_vector):
-        return _open_polygons(entry, path, ground_view)
+        return _open_polygons(entry, path, image, ground_view)
     return open_raster_mask(entry, path, image, ground_view.shape)
 
 
-def _open_polygons(entry: MaskEntry, path: Path, ground_view: GroundView) -> PolygonMask:
+def _open_polygons(entry: MaskEntry, path: Path, image: Path, ground_view: GroundView) -> PolygonMask:
     if entry.band is not None or entry.names is not None:
         raise InputError(f"band and names are for rasters, and {path} holds polygons. Leave them out.")
     found, is_region = _polygons_of(entry, path)
     polygons = found.polygons
     if found.crs is not None:
         polygons = ground_view.pixels_of(polygons, found.crs, entry.height, path)
-    return PolygonMask.of(path, ground_view.shape, polygons, is_region != bool(entry.outside))
+    polygon_mask = PolygonMask.of(path, ground_view.shape, polygons, is_region != bool(entry.outside))
+    if len(found.polygons) and polygon_mask.is_beside_image:
+        covered = "every pixel" if polygon_mask.is_outside else "no pixel"
+        warnings.warn(
+            f"The mask {path} covers {covered} of {image}, because its polygons lie beside the image. Check their "
+            "coordinates and the height.",
+            ZlocusWarning,
+            stacklevel=2,
+        )
+    return polygon_mask
 
 
 def _polygons_of(entry: MaskEntry, path: Path) -> tuple[MaskPolygons, bool]:

@@ -75,6 +75,14 @@ class PolygonMask:
             digest.update(wkb)
         return cls(path, shape, with_area, is_outside, digest.digest())
 
+    @property
+    def is_beside_image(self) -> bool:
+        """Whether no polygon reaches into the image."""
+        rows, cols = self.shape
+        west, south, east, north = shapely.bounds(self.polygons).T if len(self.polygons) else np.empty((4, 0))
+        reaches = (west <= cols - 0.5) & (east >= -0.5) & (south <= rows - 0.5) & (north >= -0.5)
+        return not bool(reaches.any())
+
     def covers(self, row: int, col: int, rows: int, cols: int) -> NDArray[np.bool_]:
         """See `MaskPart`."""
         masked = np.zeros((rows, cols), bool)
