@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import zipfile
 
 import laspy
@@ -22,6 +23,8 @@ from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rerun import run_again
+from zlocus.products.ortho_colours import colour_records, colour_sentence
+from zlocus.products.report.page import write_report
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +61,25 @@ def test_the_ortho_image_has_the_colours(surface):
     red, green, blue = (band[valid].mean() for band in bands)
     assert green / red == pytest.approx(0.75, abs=0.01)
     assert blue / red == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_run_says_what_gives_the_colours(surface):
+    record = json.loads((surface / "run.json").read_text())
+    names = [path.rpartition("/")[2] for path in record["colours"].values()]
+    assert all("-M1BS-" in name for name in names)
+    sentence = f"The ortho-image has the colours of {', '.join(names)}."
+    assert colour_sentence(record["colours"]) == sentence
+    write_report(surface)
+    assert sentence in (surface / "report.html").read_text()
+
+
+def test_why_an_ortho_image_is_grey(taken, tmp_path):
+    root = maxar_delivery(tmp_path / "delivery", taken)
+    shutil.rmtree(next(root.glob("*P001_MUL")))
+    records = colour_records(open_scene([root]).views)
+    assert colour_sentence(records).startswith("The ortho-image is grey, because")
+    assert "and WV03_20141005T160138 has none" in colour_sentence(records)
+    assert colour_records(open_scene([write_single(tmp_path / "single", shot) for shot in taken]).views) == {}
 
 
 def test_the_cloud_has_the_colours(archive, tmp_path):

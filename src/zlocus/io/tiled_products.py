@@ -249,7 +249,7 @@ def named_file(index: Path, name: str) -> Path:
         raise InputError(f"{index} names the file {quoted(name)}, which does not lie below its folder. {ADVICE}")
     path = index.parent / at
     if not is_archived(path) and not path.resolve().is_relative_to(index.parent.resolve()):
-        raise InputError(f"{index} names the file {quoted(name)}, which is a link that leaves its folder. {ADVICE}")
+        raise InputError(f"{index} names the file {path.name!r}, which is a link that leaves its folder. {ADVICE}")
     # Products are made on systems that do not tell capital letters from small ones.
     return file_beside(path, path.name) or path
 

@@ -59,6 +59,7 @@ from zlocus.pipeline.tile_makers import tile_maker
 from zlocus.pipeline.tile_run import Tally, TileJob, TileRun, tile_job, workers_for
 from zlocus.pipeline.water import far_levels, note_water, water_on_grid
 from zlocus.products.derived import check_derived
+from zlocus.products.ortho_colours import colour_records, colour_sentence
 from zlocus.products.report.file_names import RECORD, REPORT
 from zlocus.products.water import level_water
 
@@ -213,6 +214,8 @@ def prepare_surface(
 ) -> PreparedSurface:
     """Orient the views of a run and set it up: the stages between opening and matching."""
     opened_inputs = run.opened_inputs
+    if sentence := colour_sentence(colour_records(opened_inputs.scene.views)):
+        progress.note(sentence)
     progress.note(said_before_orientation(opened_inputs.scene.views, request.workers))
     with stopwatch.stage("orient"), kernels_compiling(progress):
         ties = known_ties(run.checkpoint, opened_inputs.scene, progress)

@@ -36,6 +36,7 @@ from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
 from zlocus.products.acquisitions import acquisition_records
 from zlocus.products.derived import link_all, write_derived
+from zlocus.products.ortho_colours import colour_records
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.tie_layers import write_ranking, write_ties
@@ -161,6 +162,7 @@ def _request_record(
         "inputs": list(inputs),
         "image_dates": [None if view.date is None else view.date.isoformat() for view in scene.views],
         "acquisitions": acquisition_records(scene.views),
+        "colours": colour_records(scene.views),
         "masked_shares": masked_shares(scene),
     }
 

@@ -36,6 +36,7 @@ from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.required_space import check_room_before_ties
 from zlocus.pipeline.setup import requested_crs, sorted_views
 from zlocus.products.footprints import footprints_picture, write_footprints
+from zlocus.products.ortho_colours import colour_records, colour_sentence
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
 T = TypeVar("T")
@@ -117,6 +118,8 @@ def examined(
             quality.append(findings.tried(lambda view=view: image_quality(view.image), (view.name,)))  # type: ignore[misc]
             stage.advance()
     known = [(name, found) for name, found in zip(names, quality, strict=True) if found is not None]
+    if sentence := colour_sentence(colour_records(scene.views)):
+        findings.entries.append(Finding(NOTE, sentence))
     findings.entries += quality_findings([name for name, _ in known], [found for _, found in known])
     geometry: tuple[ViewGeometry, ...] = ()
     pairs: tuple[PairGeometry, ...] = ()

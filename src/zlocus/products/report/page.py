@@ -20,6 +20,7 @@ from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality, flags_of
 from zlocus.products.acquisitions import COLUMNS, acquisition_rows
 from zlocus.products.match_curve_drawing import SVG_PX
+from zlocus.products.ortho_colours import colour_sentence
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
@@ -115,7 +116,8 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
         "footprints": footprints_part(out / FOOTPRINTS, survey, crs, list(views)),
         "heights": maps.height_map(out, survey, sun_deg), "sun": words.sun(*sun_deg),
         "corners": words.corners(survey, is_local(crs)), "bar": maps.scale_bar(survey.shape[1] * survey.cell_m),
-        "ortho": maps.ortho_map(out), "created": words.when(run.get("created")),
+        "ortho": maps.ortho_map(out), "colours": colour_sentence(run.get("colours", {})),
+        "created": words.when(run.get("created")),
         "sigma": maps.sigma_map(out),
         "quantiles": [(f"{q} %", words.size(value, "m")) for q, value in quantiles.items()],
         "used": maps.views_map(survey), "reasons": words.reasons(survey), "reasons_map": maps.reasons_map(survey),
