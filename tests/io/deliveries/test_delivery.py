@@ -178,6 +178,7 @@ def test_masks_that_are_obeyed_and_missing_are_named(made, tmp_path, vendor, whi
 
 def test_nitf_files_of_a_folder(taken, tmp_path):
     scene = open_scene([nitf_delivery(tmp_path / "n", taken)])
+    assert [view.name for view in scene.views] == [f"{shot.time:%Y%m%dT%H%M%S}" for shot in taken]
     for view, shot in zip(sorted(scene.views, key=lambda view: view.acquisition.time), taken, strict=True):
         assert np.array_equal(pixels(view), shot.grey)
         assert view.acquisition.time == shot.time

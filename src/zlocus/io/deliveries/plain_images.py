@@ -13,6 +13,7 @@ from zlocus.core.request_checks import IMAGE_SUFFIXES
 from zlocus.io.archives import is_archived
 from zlocus.io.cameras.rpc import find_sidecar, has_rpc_tag
 from zlocus.io.deliveries.delivered_image import DeliveredImage, Found, SetAside
+from zlocus.io.image_acquisition import acquisition_of
 from zlocus.io.open_raster import open_raster
 
 # Formats without tags, which mostly show in small what other files hold.
@@ -31,7 +32,9 @@ def plain_images(files: Sequence[Path]) -> Found:
             continue
         try:
             if camera is not None or has_rpc_tag(path):
-                images.append(DeliveredImage(product=path.stem, pixels=path, camera=camera))
+                with open_raster(path) as source:
+                    acquisition = acquisition_of(source)
+                images.append(DeliveredImage(path.stem, path, camera, acquisition))
             else:
                 aside.append(_without_rpc(path))
         except InputError as error:
