@@ -114,7 +114,7 @@ def test_inputs_that_are_no_scene(tmp_path, pair):
     bare = write_image(tmp_path / "no_camera" / "c.tif", PIXELS)
     for inputs, message in (
         ([], "none was given"),
-        (pair[:1], r"two images or more: only .*a\.tif was given"),
+        (pair[:1], r"two images or more: only .*a\.tif was found"),
         ([*pair, pair[0]], r"a\.tif is given twice"),
         ([pair[0], tmp_path / "link.tif"], r"link\.tif is given twice"),
         ([pair[0], tmp_path / "none.tif"], r"There is no image .*none\.tif"),

@@ -27,3 +27,9 @@ def test_records_and_rows_say_what_is_known():
         ("c", "2014-10-05", "-", "-", "-", "-"),
         ("d", "-", "-", "-", "4° off nadir", "-"),
     ]
+
+
+def test_the_page_of_the_doctor_explains_both_angles():
+    page = Path(__file__).parents[2].joinpath("docs", "how-to", "doctor.md").read_text(encoding="utf-8")
+    assert "*Off the vertical* is the incidence" in page
+    assert "*Off nadir* is the angle at the satellite" in page

@@ -103,6 +103,8 @@ def test_rpc_with_a_missing_coefficient(refused, good_pair):
 
 def test_one_image(refused, good_pair):
     assert "two images or more" in refused(good_pair[0])
+    Path("README.md").write_text("# An order")
+    assert "README.md is no image. Give images" in refused("README.md")
 
 
 def test_the_same_image_twice(refused, good_pair):

@@ -10,6 +10,8 @@ from zlocus.core.errors import ConfigError, InputError
 
 # Suffixes of the images that are looked for in a folder.
 IMAGE_SUFFIXES = (".tif", ".tiff", ".ntf", ".jp2", ".jpg", ".jpeg", ".png", ".img", ".vrt")
+# Suffixes of files that are given by mistake, because they lie beside images.
+TEXT_SUFFIXES = (".md", ".pdf", ".txt", ".htm", ".html", ".doc", ".docx", ".csv")
 # Ends of the names of files that hold or name several images, and of GDAL's names for what is in an archive.
 CONTAINERS = (".zip", ".tar", ".tgz", ".tar.gz", ".json", ".geojson")
 ARCHIVE_SYSTEMS = ("/vsizip/", "/vsitar/")
@@ -31,6 +33,10 @@ def check_inputs(inputs: tuple[Path, ...]) -> None:
         given = f"only {inputs[0]} is given" if inputs else "none is given"
         if inputs and not (inputs[0].exists() or str(inputs[0]).startswith("/vsi")):
             raise InputError(f"There is no file {inputs[0]}. Check the path.")
+        if inputs and inputs[0].suffix.lower() in TEXT_SUFFIXES:
+            raise InputError(
+                f"{inputs[0]} is no image. Give images, a scene.yaml, or the folder that a vendor delivered."
+            )
         raise InputError(
             f"A surface needs two images or more, and {given}. Add images, or give a scene.yaml, or the folder that a "
             "vendor delivered."

@@ -173,8 +173,8 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[
     scene_input = _inputs_of_scene(inputs, crs)
     opened = [_open_view(entry, scene_input.folder) for entry in scene_input.entries]
     if len(opened) < 2:
-        given = f"only {opened[0].entry.path} was given" if opened else "none was given"
-        raise InputError(f"A surface needs two images or more: {given}. Add images of the same ground.")
+        found = f"only {opened[0].entry.path} was found" if opened else "none was given"
+        raise InputError(f"A surface needs two images or more: {found}. Add images of the same ground.")
     for one, other in _with_shared_rpcs(opened):
         raise InputError(shared_rpc_message(one.entry.path, other.entry.path))
     frame = _frame_of(opened, scene_input.crs)
