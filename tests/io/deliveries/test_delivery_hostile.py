@@ -15,6 +15,7 @@ from made_up_deliveries import (
     dimap_delivery,
     gaofen_delivery,
     maxar_delivery,
+    planet_delivery,
     shots,
     stac_delivery,
     write_single,
@@ -190,7 +191,7 @@ def test_a_tile_that_is_a_link_out_of_the_delivery(taken, tmp_path):
     tile = one(root, "IMG_*_P_*_R1C1.TIF")
     tile.rename(tmp_path / "elsewhere.TIF")
     tile.symlink_to(tmp_path / "elsewhere.TIF")
-    assert "is a link that leaves its folder" in refused(root)
+    assert f"the file {tile.name!r}, which is a link that leaves its folder" in refused(root)
 
 
 def test_a_tile_that_is_a_list_of_other_files(taken, tmp_path):
@@ -301,6 +302,16 @@ def test_all_faults_of_a_delivery_are_found(taken, tmp_path):
     assert [view.name for view in usable.scene.views] == ["WV03_20141005T160218"]
     assert "gives 'numRows' twice" in usable.refused[0].reason
     assert len(usable.refused) == 1
+
+
+def test_a_damaged_rpc_does_not_hide_the_other_images(taken, tmp_path):
+    root = planet_delivery(tmp_path / "d", taken)
+    rpc = one(root, "*nadir_basic_panchromatic_dn_RPC.TXT")
+    rpc.write_text(rpc.read_text()[:1500])
+    usable = open_usable_views([root])
+    assert len(usable.scene.views) == 1
+    assert [each.path.name.partition("_basic")[2] for each in usable.refused] == ["_panchromatic_dn.tif"]
+    assert rpc.name in usable.refused[0].reason
 
 
 @pytest.mark.parametrize(("write", "rpc"), [(dimap_delivery, "RPC_*_MS_*.XML"), (maxar_delivery, "*M1BS*.RPB")])

@@ -31,6 +31,8 @@ def test_the_rpc_of_one_image_beside_another_one(taken, tmp_path):
     assert first in str(caught.value)
     assert second in str(caught.value)
     assert "have the identical RPC" in str(caught.value)
+    reasons = {each.reason for each in open_usable_views([root]).refused}
+    assert reasons == {str(caught.value)}
 
 
 def test_single_images_with_one_rpc(taken, tmp_path):

@@ -116,12 +116,14 @@ def open_delivery(path: Path, refused: list[RefusedProduct] | None = None) -> De
         images = dated_images(images, [each.path for each in found.set_aside], found.table)
         partners = _partners([image for image in images if image.product not in partners], images) | partners
     colours = {partner.image.product for partner in partners.values()}
+    is_faulty = bool(found.refused)
     for pair, sentence in contradictions(images, {*partners, *colours}):
         if refused is None:
             raise InputError(sentence)
         refused += [RefusedProduct(image.pixels, sentence) for image in pair]
         colours |= {image.product for image in pair}
-    if found.refused and any(image.spectrum is Spectrum.PANCHROMATIC for image in delivered.images):
+        is_faulty = True
+    if is_faulty and any(image.spectrum is Spectrum.PANCHROMATIC for image in delivered.images):
         # Their panchromatic images may be among those that cannot be used.
         colours |= {image.product for image in images if image.spectrum is Spectrum.MULTISPECTRAL}
     matched = [image for image in images if image.product not in colours]
@@ -142,7 +144,8 @@ def _usable(found: Found) -> Found:
             usable = usable.with_more(Found(refused=(RefusedProduct(image.pixels, str(error)),)))
             continue
         gives_colours = image.spectrum is Spectrum.MULTISPECTRAL and any(are_of_one_pass(pan, image) for pan in pans)
-        fault = _fault(image, with_rpc=gives_colours)
+        # Those of the others are read when their views are opened.
+        fault = _fault(image, with_rpc=gives_colours or image.spectrum is Spectrum.PANCHROMATIC)
         if not fault:
             usable = usable.with_more(Found((image,)))
         elif gives_colours:

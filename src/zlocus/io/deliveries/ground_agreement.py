@@ -39,10 +39,12 @@ def contradictions(images: Sequence[DeliveredImage], paired: Collection[str]) ->
     paired : products of the panchromatic images that have colours, and of the images that give them.
     """
     known = {image.product: rpc for image in images if (rpc := _image_rpc(image)) is not None}
+    doubtful = set(paired)
     for one, other in shared_rpcs(known.values(), products=True):
         pair = tuple(image for image in images if image.pixels in (one.path, other.path))
+        doubtful |= {image.product for image in pair}
         yield Contradiction(pair, shared_rpc_message(one.path, other.path))
-    left = [image for image in images if image.product not in paired and image.product in known]
+    left = [image for image in images if image.product not in doubtful and image.product in known]
     for pan in (image for image in left if image.spectrum is Spectrum.PANCHROMATIC):
         for colour in (image for image in left if image.spectrum is Spectrum.MULTISPECTRAL):
             if not are_of_one_pass(pan, colour):
