@@ -30,10 +30,10 @@ def shared_rpcs(image_rpcs: Iterable[ImageRpc], products: bool = False) -> list[
     products : whether some may be products of one exposure, such as a panchromatic and a pansharpened image; then only
     those of different exposures or sizes are found.
     """
-    by_rpc: dict[RpcCoefficients, list[ImageRpc]] = {}
+    alike_image_rpcs: dict[RpcCoefficients, list[ImageRpc]] = {}
     for image_rpc in image_rpcs:
-        by_rpc.setdefault(image_rpc.rpc, []).append(image_rpc)
-    pairs = [pair for alike in by_rpc.values() for pair in itertools.combinations(alike, 2)]
+        alike_image_rpcs.setdefault(image_rpc.rpc, []).append(image_rpc)
+    pairs = [pair for group in alike_image_rpcs.values() for pair in itertools.combinations(group, 2)]
     return [pair for pair in pairs if not (products and _are_of_one_exposure(*pair))]
 
 
