@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import re
 import struct
@@ -22,7 +23,7 @@ from made_up_deliveries import (
     zipped,
 )
 from rpc_fixtures import write_image
-from zlocus.core.errors import InputError
+from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.io.archives import SMALL_BYTES
 from zlocus.io.deliveries.delivery import describe, open_delivery
 from zlocus.io.scene_file import open_scene, open_usable_views
@@ -388,7 +389,6 @@ def test_catalogues_that_lead_back_or_are_none(taken, tmp_path):
         ),
         ("image,date\n\nnadir.tif,2014-10-05,3\n", "line 3: it has more values than the first line names columns"),
         ("image,date\n,2014-10-05\n", "line 2: it names no image"),
-        ("image,date\nfoo.tif,2014-10-05\n", "line 2: there is no image 'foo.tif'. There are nadir.tif; correct"),
         ("image,date,sun_azimuth,sun_elevation\nnadir.tif,2014-10-05,950,50\n", "line 2: '950' in sun_azimuth is not"),
         ("image,date,sun_azimuth,sun_elevation\nnadir.tif,2014-10-05,150,0\n", "line 2: '0' in sun_elevation is not"),
         ("image,date,sun_azimuth\nnadir.tif,2014-10-05,150\n", "line 2: sun_azimuth tells no direction without"),
@@ -400,6 +400,15 @@ def test_tables_of_dates_that_are_none(taken, tmp_path, table, says):
     write_single(tmp_path, taken[0])
     (tmp_path / "dates.csv").write_text(table)
     assert says in refused(tmp_path)
+
+
+def test_a_table_of_more_images_than_are_here(taken, tmp_path):
+    """A folder may hold a part of the images of an archive, with the table of all of them."""
+    write_single(tmp_path, taken[0])
+    (tmp_path / "dates.csv").write_text("image,date\nnadir.tif,2014-10-05\nfoo.tif,2014-10-05\n")
+    with pytest.warns(ZlocusWarning, match=r"names images that are not in this folder: foo\.tif \(line 3\)\."):
+        (view,) = open_delivery(tmp_path).views
+    assert view.image.acquisition.date == datetime.date(2014, 10, 5)
 
 
 def test_folders_too_deep_and_links_that_lead_back(taken, tmp_path):

@@ -12,11 +12,12 @@ import csv
 import io
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zlocus.core.errors import InputError
+from zlocus.core.errors import InputError, ZlocusWarning
 from zlocus.core.quoting import quoted
 from zlocus.core.scene import Acquisition
 from zlocus.io.deliveries.delivered_image import DeliveredImage
@@ -64,19 +65,21 @@ def dated_images(
     Raises
     ------
     InputError
-        The file is no such table, holds a value that is none of its column, or names an image twice or an unknown one.
+        The file is no such table, holds a value that is none of its column, or names an image twice.
     """
     rows = _read(path)
     of_image = [{*_names_of(image.pixels), image.product.lower().rpartition("/")[2]} for image in images]
     known = set().union(*of_image, *map(_names_of, set_aside))
-    for row in rows:
-        if not _spellings(row.name) & known:
-            names = sorted(image.pixels.name for image in images)
-            more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-            raise InputError(
-                f"{path}, line {row.number}: there is no image {quoted(row.name)}. There are "
-                f"{', '.join(names[:MAX_NAMED])}{more}; correct the name, or remove the line."
-            )
+    unknown = [row for row in rows if not _spellings(row.name) & known]
+    if unknown:
+        names = [f"{row.name} (line {row.number})" for row in unknown]
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        warnings.warn(
+            f"{path} names images that are not in this folder: {', '.join(names[:MAX_NAMED])}{more}. What it says of "
+            "them has no effect; correct the names where these images should be here.",
+            ZlocusWarning,
+            stacklevel=2,
+        )
     return [_with_row(image, names, rows) for image, names in zip(images, of_image, strict=True)]
 
 
