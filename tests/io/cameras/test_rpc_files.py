@@ -91,7 +91,7 @@ def test_dim_file_leads_to_its_rpc_file(tmp_path):
     image = write_image(tmp_path / "crop.tif", PIXELS)
     dim = tmp_path / "DIM_X.XML"
     dim.write_text(dimap_dim({"crop.tif": (1, 1)}, (8, 8), "RPC_Y.XML"))
-    with pytest.raises(InputError, match="DIM_X.XML names RPC_Y.XML, which is missing"):
+    with pytest.raises(InputError, match=r"DIM_X\.XML names RPC_Y\.XML, which is missing"):
         read_rpc(image)
     (tmp_path / "RPC_X.XML").write_text(dimap_rpc(moved_off(RPC)))
     (tmp_path / "RPC_Y.XML").write_text(dimap_rpc(RPC))
