@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zlocus.core.errors import ZlocusNote, ZlocusWarning
+from zlocus.core.quoting import first_names
 from zlocus.core.scene import NOT_KNOWN, Acquisition
 from zlocus.io.archives import is_archived, member_of
 from zlocus.io.cameras.camera_entry import CameraEntry
@@ -85,9 +86,8 @@ def _warn_of_missing_masks(delivery: Delivery) -> None:
     if not missing:
         return
     masks = "a mask that belongs" if len(missing) == 1 else f"{len(missing)} masks that belong"
-    more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
     warnings.warn(
-        f"{delivery.path} lacks {masks} to its images: {', '.join(missing[:MAX_NAMED])}{more}. Clouds and defects "
+        f"{delivery.path} lacks {masks} to its images: {first_names(missing, MAX_NAMED)}. Clouds and defects "
         "there will be matched. Copy what is missing from the delivery, or give masks in a scene.yaml.",
         ZlocusWarning,
         stacklevel=3,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zlocus.core.progress import Progress
+from zlocus.core.quoting import first_names
 from zlocus.io.grid_inputs import lacks_vertical_datum
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.plausibility import Doubt
@@ -19,8 +20,7 @@ MIN_VIEWS = 2
 
 def some_names(names: Sequence[str]) -> str:
     """The first names, separated by commas, and how many more there are."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
+    return first_names(names, MAX_NAMED)
 
 
 def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import shapely
 from odc.geo.geobox import GeoBox
@@ -12,6 +10,7 @@ from pyproj import CRS
 from zlocus.core.errors import InputError
 from zlocus.core.height_range import HeightRange
 from zlocus.core.progress import Progress
+from zlocus.core.quoting import first_names
 from zlocus.core.requests import DsmRequest
 from zlocus.io.vertical import VerticalDatum
 from zlocus.io.water_polygons import WaterPolygons
@@ -42,7 +41,7 @@ def water_on_grid(water_polygons: WaterPolygons, geobox: GeoBox, progress: Progr
         )
     if beside:
         lies = "lies outside the grid and has" if len(beside) == 1 else "lie outside the grid and have"
-        progress.note(f"{_named(beside).capitalize()} of {water_polygons.path} {lies} no effect.")
+        progress.note(f"{first_names(beside, MAX_NAMED).capitalize()} of {water_polygons.path} {lies} no effect.")
     return water_polygons.only(np.isin(water_polygons.names, beside, invert=True))
 
 
@@ -80,7 +79,7 @@ def note_water(water_found: WaterFound, request: DsmRequest, progress: Progress)
     levelled = water_found.levelled_surfaces
     if levelled:
         said = [f"{each.name} at {each.level.height_m:.2f} m" for each in levelled]
-        progress.note(f"Water levelled: {_named(said)}.")
+        progress.note(f"Water levelled: {first_names(said, MAX_NAMED)}.")
     water_found.doubts += _doubts(water_found)
     for sentence in water_found.doubts:
         progress.note(sentence)
@@ -100,15 +99,15 @@ def _doubts(water_found: WaterFound) -> list[str]:
     doubts = []
     if water_found.left:
         doubts.append(
-            f"Too few heights at the shore tell the level of {_named(water_found.left)}, and the matched heights stay "
-            "there. Give levels by --water-level."
+            f"Too few heights at the shore tell the level of {first_names(water_found.left, MAX_NAMED)}, and the "
+            "matched heights stay there. Give levels by --water-level."
         )
     found = [each for each in water_found.levelled_surfaces if each.level.sigma_m > UNCERTAIN_M]  # NaN where given
     steep = [f"{each.name} (by {each.level.sigma_m:.1f} m)" for each in found if each.level.source != "inside"]
     if steep:
         doubts.append(
-            f"The ground rises steeply from the water, whose level may be too high: {_named(steep)}. Give the "
-            "level by --water-level where it is known."
+            f"The ground rises steeply from the water, whose level may be too high: {first_names(steep, MAX_NAMED)}. "
+            "Give the level by --water-level where it is known."
         )
     land = [
         f"{each.name} (over {100 * each.level.inside_share:.0f} %, with a relief of {each.level.sigma_m:.1f} m)"
@@ -117,13 +116,7 @@ def _doubts(water_found: WaterFound) -> list[str]:
     ]
     if land:
         doubts.append(
-            f"Matched like land, which water is not: {_named(land)}. Its median became the level; check the polygons "
-            "and their CRS."
+            f"Matched like land, which water is not: {first_names(land, MAX_NAMED)}. Its median became the "
+            "level; check the polygons and their CRS."
         )
     return doubts
-
-
-def _named(names: Sequence[str]) -> str:
-    """Names in a sentence, the first few of many."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return f"{', '.join(names[:MAX_NAMED])}{more}"

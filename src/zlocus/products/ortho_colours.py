@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from zlocus.core.quoting import first_names
 from zlocus.core.scene import ImageSource, View
 from zlocus.io.images import RasterImage
 from zlocus.sensors.line_shifts import StraightenedImage
@@ -34,18 +35,14 @@ def colour_sentence(records: Mapping[str, str | None]) -> str:
     grey = [name for name, path in records.items() if path is None]
     if grey:
         return (
-            f"The ortho-image is grey, because it takes colours of every image, and {_some(grey)} "
+            f"The ortho-image is grey, because it takes colours of every image, and {first_names(grey, MAX_NAMED)} "
             f"{'has' if len(grey) == 1 else 'have'} none: no multispectral image of the same pass and ground was found."
         )
-    return f"The ortho-image has the colours of {_some([str(path).rpartition('/')[2] for path in records.values()])}."
+    names = [str(path).rpartition("/")[2] for path in records.values()]
+    return f"The ortho-image has the colours of {first_names(names, MAX_NAMED)}."
 
 
 def _raster_image(image: ImageSource) -> RasterImage | None:
     """The image of a file; None for another source."""
     image = image.displaced_image if isinstance(image, StraightenedImage) else image
     return image if isinstance(image, RasterImage) else None
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more

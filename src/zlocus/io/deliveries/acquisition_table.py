@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zlocus.core.errors import InputError, ZlocusWarning
-from zlocus.core.quoting import quoted
+from zlocus.core.quoting import first_names, quoted
 from zlocus.core.scene import Acquisition
 from zlocus.io.deliveries.delivered_image import DeliveredImage
 from zlocus.io.image_acquisition import acquisition_from, time_in
@@ -73,9 +73,8 @@ def dated_images(
     unknown = [row for row in rows if not _spellings(row.name) & known]
     if unknown:
         names = [f"{row.name} (line {row.number})" for row in unknown]
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
         warnings.warn(
-            f"{path} names images that are not in this folder: {', '.join(names[:MAX_NAMED])}{more}. What it says of "
+            f"{path} names images that are not in this folder: {first_names(names, MAX_NAMED)}. What it says of "
             "them has no effect; correct the names where these images should be here.",
             ZlocusWarning,
             stacklevel=2,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zlocus.core.errors import InputError
-from zlocus.core.quoting import counted
+from zlocus.core.quoting import counted, first_names
 from zlocus.core.scene import Acquisition
 from zlocus.io.archives import is_archive, is_archived, is_folder_in_archive, path_in_archive
 from zlocus.io.cameras.rpc import read_rpc
@@ -255,15 +255,10 @@ def describe(delivery: Delivery) -> str:
     for each in delivery.set_aside:
         by_reason.setdefault(each.reason, []).append(each.path.name)
     if by_reason:
-        parts = [f"{_some(names)} ({reason})" for reason, names in by_reason.items()]
+        parts = [f"{first_names(names, MAX_NAMED)} ({reason})" for reason, names in by_reason.items()]
         sentences.append(f"Left out: {'; '.join(parts)}.")
     if delivery.lone:
-        named = _some([view.name for view in delivery.lone])
+        named = first_names([view.name for view in delivery.lone], MAX_NAMED)
         why = "because no panchromatic image of its pass and ground was found"
         sentences.append(f"Multispectral, and matched by itself, {why}: {named}.")
     return " ".join(sentences)
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return f"{', '.join(names[:MAX_NAMED])}{more}"
