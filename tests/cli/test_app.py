@@ -76,6 +76,10 @@ def test_help_imports_nothing_heavy():
 
 def test_version(zl):
     assert zl("--version").stdout == f"zlocus {zlocus.__version__}\n"
+    assert json.loads(zl("--json", "--version").stdout) == {"version": zlocus.__version__}
+    refused = zl("--json", "dsm", "a.tif")
+    assert refused.exit_code == 2
+    assert "it goes with --version, or after the name of a command" in refused.stderr
 
 
 @pytest.mark.parametrize(

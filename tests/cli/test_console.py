@@ -20,7 +20,7 @@ from zlocus.cli.commands import command_of
 from zlocus.cli.config import ConfigOptions
 from zlocus.cli.console import Console, OutputOptions
 from zlocus.cli.exit_status import show_our_warnings
-from zlocus.core.errors import CoverageError, ZlocusWarning
+from zlocus.core.errors import CoverageError, ZlocusNote, ZlocusWarning
 from zlocus.core.signals import Ended
 from zlocus.io.run_record import Stopwatch
 
@@ -45,6 +45,7 @@ def said(tmp_path):
             with Stopwatch().stage("work"), console.progress.stage("Working"):
                 console.progress.note("Half of it is done.")
             warnings.warn("mind this.", ZlocusWarning, stacklevel=1)
+            warnings.warn("and this, which harms nothing.", ZlocusNote, stacklevel=1)
             if error is not None:
                 raise error
             return answer or Answer("All is done.", {"coverage": 0.5})
@@ -65,6 +66,7 @@ def test_text_goes_to_standard_output_and_progress_to_standard_error(said):
     assert result.stderr.splitlines()[0] == "Half of it is done."
     assert "Working: done in" in result.stderr
     assert "zlocus: mind this." in result.stderr
+    assert "zlocus: and this, which harms nothing." in result.stderr
     assert "Stage work" not in result.stderr
 
 

@@ -515,6 +515,9 @@ def test_the_time_of_tasks_is_that_while_any_of_them_worked():
 
 def test_one_run_says_that_it_takes_a_plan_over(zl, images, out, tmp_path):
     dsm = command(images("sine"), out, tmp_path)
+    planned = zl(*dsm[dsm.index("dsm") :], "--dry-run")
+    assert "holds a plan of tasks for this surface" in planned.stdout
+    assert (out / FOLDER).exists()
     done = zl(*dsm[dsm.index("dsm") :], "--json")
     assert done.exit_code == 0, done.output
     record = json.loads(done.stdout)

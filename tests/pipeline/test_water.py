@@ -258,7 +258,9 @@ def test_doubtful_levels_are_said_in_the_log_and_recorded(level, said):
 
 
 def test_looking_for_water_where_there_is_none_is_said():
-    assert "--level-water levels nothing" in said_of(WaterFound(), level_water=True)
+    water_found = WaterFound()
+    assert "--level-water levels nothing" in said_of(water_found, level_water=True)
+    assert "--level-water levels nothing" in water_found.as_dict()["doubts"][0]
     assert "levels nothing" not in said_of(WaterFound(n_possible=1), level_water=True) + said_of(WaterFound())
 
 

@@ -6,6 +6,7 @@ once.
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Sequence
@@ -76,19 +77,17 @@ for name, options, run in COMMANDS:
 app.add_typer(tiles, short_help=tiles.info.help)
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        print(f"zlocus {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _options(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --version: print it as one JSON object.")] = False,
 ) -> None:
     """Options before the command."""
+    if version:
+        print(json.dumps({"version": __version__}) if as_json else f"zlocus {__version__}")
+        raise typer.Exit
+    if as_json:
+        raise typer.BadParameter("it goes with --version, or after the name of a command.", param_hint="--json")
 
 
 def command_name(words: Sequence[str]) -> str:

@@ -58,7 +58,8 @@ class OutputOptions:
 class Console:
     """Says what a command tells its user.
 
-    progress : of the command; is_verbose : whether traces of errors are printed; notes : sentences that were said on
+    progress : of the command; is_verbose : whether traces of errors are printed; is_quiet : whether only warnings and
+    errors are said; notes : sentences that were said on
     the way, warnings among them, kept where --json prints them.
     """
 
@@ -75,10 +76,10 @@ class Console:
         self._command, self._options, self._given = command, options or OutputOptions(), given or {}
         self._log: logging.Logger | None = None
         self._warnings: logging.Handler | None = None
-        self.is_verbose = self._options.verbose
-        if self._options.quiet and self.is_verbose:
+        self.is_verbose, self.is_quiet = self._options.verbose, self._options.quiet
+        if self.is_quiet and self.is_verbose:
             raise ConfigError("--quiet and --verbose exclude each other. Leave one out.")
-        self.progress: Progress = SilentProgress() if self._options.quiet else progress_for(sys.stderr)
+        self.progress: Progress = SilentProgress() if self.is_quiet else progress_for(sys.stderr)
         self.notes: list[str] = []
         if self._options.log is not None or self.is_verbose:
             self._open_log()

@@ -11,12 +11,13 @@ import textwrap
 import traceback
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 import typer
 
 from zlocus.cli.console import Console
-from zlocus.core.errors import ZlocusError, ZlocusWarning
+from zlocus.core.errors import ZlocusError, ZlocusNote, ZlocusWarning
 from zlocus.core.parallel import is_busy
 from zlocus.core.signals import Ended, end_children, ended_by_signals, exit_status, leave, sentence_of
 
@@ -24,6 +25,16 @@ EXIT_OWN_FAULT = 1
 LOGGER = logging.getLogger("zlocus")
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+@dataclass
+class _ShownWarnings:
+    """Which of our warnings are printed. with_notes : also those that make no result worse."""
+
+    with_notes: bool = True
+
+
+SHOWN_WARNINGS = _ShownWarnings()
 
 
 def explained(command: Callable[P, R], console: Console | None = None) -> Callable[P, R]:
@@ -34,6 +45,7 @@ def explained(command: Callable[P, R], console: Console | None = None) -> Callab
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        SHOWN_WARNINGS.with_notes = console is None or not console.is_quiet
         try:
             return ended_by_signals(command, *args, **kwargs)
         except ZlocusError as error:
@@ -89,7 +101,8 @@ def show_our_warnings() -> None:
 
     def show_warning(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
         if issubclass(category, ZlocusWarning):
-            _say(f"zlocus: {message}")
+            if SHOWN_WARNINGS.with_notes or not issubclass(category, ZlocusNote):
+                _say(f"zlocus: {message}")
             if LOGGER.hasHandlers():
                 LOGGER.warning("zlocus: %s", message)
         else:

@@ -13,7 +13,8 @@ from zlocus.core.quoting import counted
 from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupRequest
 from zlocus.io.run_record import Stopwatch
 from zlocus.pipeline.cloud import oriented_cloud
-from zlocus.pipeline.dsm import check_before_opening, prepare_surface
+from zlocus.pipeline.dsm import TAKES_PLAN_OVER, check_before_opening, prepare_surface
+from zlocus.pipeline.execution.checkpoint import has_plan
 from zlocus.pipeline.extent import Extent, above
 from zlocus.pipeline.open_run import OpenRun, open_cloud_run, open_run
 from zlocus.pipeline.orient import control_points, options_of_command, terrain_heights
@@ -60,6 +61,8 @@ def plan_dsm(request: DsmRequest, config: RunConfig, progress: Progress) -> DryR
         lines.append(
             f"Water: {n_water} polygon{'s' if n_water > 1 else ''} of {surface.water_polygons.path} will be levelled."
         )
+    if run.checkpoint.is_of_this_run and has_plan(request.out):
+        lines.append(TAKES_PLAN_OVER.format(out=request.out))
     lines += _end_of(surface.plan, run)
     return DryRun("\n".join(lines), values)
 

@@ -63,8 +63,11 @@ from zlocus.products.ortho_colours import colour_records, colour_sentence
 from zlocus.products.report.file_names import RECORD, REPORT
 from zlocus.products.water import level_water
 
-# What becomes of a plan of tasks.
-THIS_RUN_INSTEAD = "This run makes it at once, with the tiles that are finished, and removes the plan."
+# What becomes of a plan of tasks. out : folder of the results.
+TAKES_PLAN_OVER = (
+    "{out} holds a plan of tasks for this surface (`zlocus tiles`). This run makes it at once, with the tiles that are "
+    "finished, and removes the plan."
+)
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_run(request, config, progress)
     if run.checkpoint.is_of_this_run and has_plan(request.out):
-        progress.note(f"{request.out} holds a plan of tasks for this surface (`zlocus tiles`). {THIS_RUN_INSTEAD}")
+        progress.note(TAKES_PLAN_OVER.format(out=request.out))
     if run.finished is not None:
         missing = missing_products(request, run.finished, progress)
         if not missing.matched:

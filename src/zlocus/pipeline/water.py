@@ -80,7 +80,7 @@ def note_water(water_found: WaterFound, request: DsmRequest, progress: Progress)
     if levelled:
         said = [f"{each.name} at {each.level.height_m:.2f} m" for each in levelled]
         progress.note(f"Water levelled: {first_names(said, MAX_NAMED)}.")
-    water_found.doubts += _doubts(water_found)
+    water_found.doubts += _doubts(water_found, request)
     for sentence in water_found.doubts:
         progress.note(sentence)
     if water_found.n_possible and not request.level_water:
@@ -88,15 +88,15 @@ def note_water(water_found: WaterFound, request: DsmRequest, progress: Progress)
             f"Possible water in {water_found.n_possible} area{'s' if water_found.n_possible > 1 else ''} (3 in "
             "water.tif): the images agree at no height there. --water or --level-water levels it."
         )
-    if request.level_water and not water_found.n_possible:
-        progress.note(
-            "--level-water levels nothing: no area looks like water, dark, flat at its rim and without matches."
-        )
 
 
-def _doubts(water_found: WaterFound) -> list[str]:
+def _doubts(water_found: WaterFound, request: DsmRequest) -> list[str]:
     """Sentences about water surfaces without a level, and about levels that the images tell badly."""
     doubts = []
+    if request.level_water and not water_found.n_possible:
+        doubts.append(
+            "--level-water levels nothing: no area looks like water, dark, flat at its rim and without matches."
+        )
     if water_found.left:
         doubts.append(
             f"Too few heights at the shore tell the level of {first_names(water_found.left, MAX_NAMED)}, and the "
