@@ -129,6 +129,26 @@ def water(results: AllResults) -> str:
     return markdown(head, lines)
 
 
+@table("flags")
+def flags(results: AllResults) -> str:
+    """What each warning of quality.tif marks on scenes with truth, by recipe."""
+    it, lines = of_row(results, "flags"), []
+    labels = [f.what.partition(", heights off")[0] for f in it.figures if ", heights off by" in f.what]
+    whats = ("marked, off by more than 3 sigma", "marked, wrong", "of the wrong heights", "of the right heights")
+    for label in labels:
+        off, wrong = (it.value(f"{label}, {what}") for what in ("heights off by more than 3 sigma", "wrong heights"))
+        lines.append([label, "all heights", f"{off:.1%}", f"{wrong:.1%}", "100 %", "100 %"])
+        start, end = f"{label}, ", f": {whats[0]}"
+        names = [
+            f.what.removeprefix(start).removesuffix(end)
+            for f in it.figures
+            if f.what.startswith(start) and f.what.endswith(end)
+        ]
+        lines += [[label, name, *(f"{it.value(f'{label}, {name}: {what}'):.1%}" for what in whats)] for name in names]
+    head = ["scenes", "cells with", "off by more than 3 sigma", "wrong", "of the wrong heights", "of the right heights"]
+    return markdown(head, lines)
+
+
 @table("troubles")
 def troubles(results: AllResults) -> str:
     """Painted troubles: share of the cells with a height, and of these heights those off by more than 3 and 10 m."""

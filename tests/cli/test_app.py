@@ -76,7 +76,9 @@ def test_help_imports_nothing_heavy():
 
 def test_version(zl):
     assert zl("--version").stdout == f"zlocus {zlocus.__version__}\n"
-    assert json.loads(zl("--json", "--version").stdout) == {"version": zlocus.__version__}
+    assert json.loads(zl("--json", "--version").stdout) == {
+        "command": "", "version": zlocus.__version__, "exit_status": 0,
+    }  # fmt: skip
     refused = zl("--json", "dsm", "a.tif")
     assert refused.exit_code == 2
     assert "it goes with --version, or after the name of a command" in refused.stderr

@@ -26,6 +26,7 @@ def judged(**changed):
         "covering": 3,
         "seeing": 3,
         "group_distance": 0.5,
+        "sigma_steps": 1.01,
     }
     arrays = {name: np.full((7, 9), value) for name, value in values.items()}
     for name, value in changed.items():
@@ -46,8 +47,8 @@ def judged(**changed):
         nothing,
         nothing.astype(bool),
     )
-    group_distance = arrays["group_distance"].astype(np.float32)
-    return judge(heights, refined, arrays["covering"], arrays["seeing"], group_distance, 99, OPTIONS)
+    group_distance, sigma_steps = arrays["group_distance"].astype(np.float32), arrays["sigma_steps"].astype(np.float32)
+    return judge(heights, refined, arrays["covering"], arrays["seeing"], group_distance, sigma_steps, 99, OPTIONS)
 
 
 def test_good_cells_have_no_reason():
@@ -74,6 +75,11 @@ def test_a_reason(changed, reason):
     assert quality[AT] == reason
     quality[AT] = 0
     assert (quality == 0).all()
+
+
+@pytest.mark.parametrize("changed", [{"group_distance": 3.0}, {"refined": False}])
+def test_signs_of_a_wrong_height_warn_of_nothing_where_the_height_is_precise(changed):
+    assert (judged(sigma_steps=np.full((7, 9), 0.99), **changed) == 0).all()
 
 
 @pytest.mark.parametrize("changed", [{"best": 1}, {"best": 98}, {"ncc": 0.51}, {"uniqueness": 64}, {"seeing": 2}])

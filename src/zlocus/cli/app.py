@@ -6,7 +6,6 @@ once.
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from zlocus import __version__
+from zlocus.cli.answer import Answer
 from zlocus.cli.cloud import CloudOptions, cloud
 from zlocus.cli.commands import Command, command_of
 from zlocus.cli.compare import CompareOptions, compare
@@ -84,7 +84,7 @@ def _options(
 ) -> None:
     """Options before the command."""
     if version:
-        print(json.dumps({"version": __version__}) if as_json else f"zlocus {__version__}")
+        Console("", OutputOptions(as_json=as_json)).answer(Answer(f"zlocus {__version__}"))
         raise typer.Exit
     if as_json:
         raise typer.BadParameter("it goes with --version, or after the name of a command.", param_hint="--json")

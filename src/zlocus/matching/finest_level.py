@@ -86,9 +86,9 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     predictors = uncertainty_predictors(result.heights, refined, n_views, texture, config.pyramid.halo)
     last_index = match_scene.n_steps - 1
     group_distance = np.exp(predictors["group_distance"])
-    quality = judge(result.heights, refined, n_covering, n_views, group_distance, last_index, config.checks)
-    _mark_overlap(quality, result, ground, refined.height)
     sigma = sigma_steps(predictors, refined, match_scene.line_shift_steps)
+    quality = judge(result.heights, refined, n_covering, n_views, group_distance, sigma, last_index, config.checks)
+    _mark_overlap(quality, result, ground, refined.height)
     is_uneven = spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps
     is_noise = ground.is_at_edge_in(result.level.window) & is_uneven
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)

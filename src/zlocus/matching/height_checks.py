@@ -27,6 +27,7 @@ def judge(
     n_covering: NDArray[np.integer],
     n_seeing: NDArray[np.integer],
     group_distance: NDArray[np.float32],
+    sigma_steps: NDArray[np.float32],
     last_index: int,
     options: CheckOptions,
 ) -> NDArray[np.uint16]:
@@ -34,8 +35,11 @@ def judge(
 
     n_covering : (r, c), images that cover the cell at any height; n_seeing : (r, c), images that see the surface there;
     group_distance : (r, c) float32 steps, distance between the heights of two groups of image pairs around the cell
-    (it takes the place of a cross-consistency check, which needs a reference image); last_index : highest height index
-    of the scene.
+    (it takes the place of a cross-consistency check, which needs a reference image); sigma_steps : (r, c) float32,
+    standard deviations of the heights; last_index : highest height index of the scene.
+
+    DISPUTED and UNREFINED are signs of a wrong height that many right heights show, too. The standard deviation weighs
+    all signs at once; where it is small they warn of nothing.
     """
     quality = np.zeros(heights.best.shape, np.uint16)
 
@@ -54,8 +58,9 @@ def judge(
     mark(is_seen & (refined.ncc < options.weak_ncc), Quality.WEAK)
     mark(heights.uniqueness < options.min_uniqueness, Quality.AMBIGUOUS)
     mark(is_at_jump, Quality.JUMP)
-    mark(~refined.is_refined, Quality.UNREFINED)
-    mark(is_seen & (group_distance > options.disputed_steps), Quality.DISPUTED)
+    is_uncertain = sigma_steps > options.uncertain_sigma_steps
+    mark(is_uncertain & ~refined.is_refined, Quality.UNREFINED)
+    mark(is_uncertain & is_seen & (group_distance > options.disputed_steps), Quality.DISPUTED)
     return quality
 
 

@@ -22,9 +22,9 @@ class Quality(IntFlag):
     WEAK = 256  # the images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
-    UNREFINED = 2048  # the sub-step refinement did not converge; the height is that of the semi-global constraint
+    UNREFINED = 2048  # uncertain, and without sub-step refinement: the height is that of the semi-global constraint
     FILLED = 4096  # no match; the height is interpolated from the neighbours
-    DISPUTED = 8192  # two groups of image pairs find different heights around the cell
+    DISPUTED = 8192  # uncertain, and two groups of image pairs find different heights around the cell
     IMAGE_EXCLUDED = 16384  # an image that may show the cell was not used: its mask covers it, or it is too oblique
     PLANE = 32768  # without texture of its own; the height is that of a plane fitted to the whole segment
     # Both bits together, which no other cell has: water, whose height is the level of its whole surface.

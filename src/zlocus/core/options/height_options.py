@@ -98,6 +98,11 @@ class CheckOptions(Checked):
         1.0, "A cell is marked as DISPUTED where the heights of two groups of image pairs differ by more than this "
         "around it.", low=0.0, high=100.0, unit="steps",
     )  # fmt: skip
+    uncertain_sigma_steps: float = option(
+        1.0, "A cell is marked as DISPUTED or UNREFINED only where its standard deviation is larger than this: the "
+        "standard deviation weighs all signs of a wrong height, these two among them.",
+        low=0.0, high=100.0, unit="steps",
+    )  # fmt: skip
     min_uniqueness: int = option(
         64, "A cell is marked as AMBIGUOUS when the path costs of another height, summed over the eight paths, are "
         "larger by less than this.",
