@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +23,8 @@ from zlocus.core.requests import DsmRequest
 from zlocus.evaluation.accuracy import Accuracy
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.statistics import ErrorStatistics
+from zlocus.io.config import config_as_dict
+from zlocus.products.report.command_line import command_line
 
 HEAVY = ("numpy", "numba", "scipy", "rasterio", "pyproj", "cv2", "pydantic", "rich.progress", "matplotlib", "odc")
 
@@ -124,6 +128,26 @@ def test_dsm_options_reach_the_pipeline(zl, pipeline, tmp_path):
         overwrite=True,
     )  # fmt: skip
     assert "98.7 %" in result.stdout
+
+
+def test_the_command_of_the_report_asks_for_the_same_surface(zl, pipeline, tmp_path):
+    config = RunConfig()
+    config = replace(
+        config, pyramid=replace(config.pyramid, tile=300), products=replace(config.products, contours_of="dtm")
+    )
+    request = DsmRequest(
+        inputs=(Path("a b.tif"), Path("it's.tif")), out=tmp_path / "out", resolution=0.1, bounds=(1, 2, 3.25, 4),
+        heights=(-10.5, 50), partial=True, memory_gb=3, vertical="egm96", fill="interpolate",
+        products=("hillshade", "dtm"), report=False, water=Path("w.gpkg"), level_water=True,
+    )  # fmt: skip
+    asked = {field.name: getattr(request, field.name) for field in fields(request)}
+    run = {"config": {"request": json.loads(json.dumps(asked, default=str)), "options": config_as_dict(config)}}
+    program, *words = shlex.split(command_line(run))
+    assert program == "zlocus"
+    result = zl(*words)
+    assert result.exit_code == 0, result.output
+    assert pipeline.request == request
+    assert pipeline.config == config
 
 
 @pytest.mark.parametrize(

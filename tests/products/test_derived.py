@@ -22,7 +22,7 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, OutputError
 from zlocus.core.options import ProductOptions, RunConfig
 from zlocus.core.progress import SilentProgress
-from zlocus.core.requests import DEFAULT_PRODUCTS, PRODUCTS, product_names
+from zlocus.core.requests import DEFAULT_PRODUCTS, PRODUCTS, added_products, product_names
 from zlocus.io.config import config_as_dict
 from zlocus.io.crs import local_frame
 from zlocus.io.rasters import write_cog
@@ -152,6 +152,9 @@ def test_names_of_products():
     assert product_names("none") == ()
     assert product_names("laz, hillshade") == ("hillshade", "laz")
     assert product_names(",".join(PRODUCTS)) == PRODUCTS
+    assert added_products("laz,dtm") == ("hillshade", "dtm", "laz")
+    assert added_products("hillshade") == DEFAULT_PRODUCTS
+    assert added_products("none") == ()
     assert set(FILES) == set(PRODUCTS) >= set(DEFAULT_PRODUCTS)
     for wrong in ("", "hillshade,", "shade", "none,laz"):
         with pytest.raises(ConfigError, match=r"--products .*is not known; choose from hillshade, contours, dtm, laz"):

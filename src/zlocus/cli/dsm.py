@@ -11,7 +11,6 @@ import typer
 from zlocus.cli.answer import Answer
 from zlocus.cli.commands import config_of
 from zlocus.cli.console import Console
-from zlocus.cli.products import PRODUCTS_HELP
 from zlocus.cli.shared_options import (
     AREA_AND_GRID,
     HEIGHTS,
@@ -39,9 +38,15 @@ from zlocus.core.requests import (
     DEFAULT_PRODUCTS,
     METHODS,
     METHODS_OF_SELECTION,
+    PRODUCTS,
     DsmRequest,
+    added_products,
     check_output,
-    product_names,
+)
+
+MAPS_HELP = (
+    f"Maps to make beside the {' and the '.join(DEFAULT_PRODUCTS)}: "
+    f"{', '.join(name for name in PRODUCTS if name not in DEFAULT_PRODUCTS)} (separated by commas); none: no map."
 )
 
 
@@ -147,8 +152,8 @@ class DsmOptions:
     ] = None
     memory: Memory = None
     resume: Resume = True
-    maps: Annotated[str, typer.Option("--products", help=PRODUCTS_HELP, metavar="LIST", rich_help_panel=RESULT)] = (
-        ",".join(DEFAULT_PRODUCTS)
+    maps: Annotated[str, typer.Option("--products", help=MAPS_HELP, metavar="LIST", rich_help_panel=RESULT)] = ",".join(
+        DEFAULT_PRODUCTS
     )
     overwrite: Overwrite = False
     report: Annotated[bool, typer.Option("--report/--no-report", help="Make report.html.", rich_help_panel=RESULT)] = (
@@ -174,7 +179,7 @@ def dsm_request(options: DsmOptions) -> DsmRequest:
         water=options.water, water_level=options.water_level, level_water=options.level_water,
         partial=options.partial,
         workers=options.workers, scheduler=options.scheduler, memory_gb=options.memory, overwrite=options.overwrite,
-        resume=options.resume, products=product_names(options.maps), report=options.report,
+        resume=options.resume, products=added_products(options.maps), report=options.report,
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ EXAMPLES = {
     "dsm": """
         zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --dry-run
         zlocus dsm img_1.tif img_2.tif img_3.tif -o surface --resolution 0.5
-        zlocus dsm scene.yaml -o surface --dem dem.tif --products hillshade,dtm
+        zlocus dsm scene.yaml -o surface --dem dem.tif --products dtm
         """,
     "products": "zlocus products surface --products contours,dtm",
     "cloud": "zlocus cloud scene.yaml -o cloud --reference img_2 --fill interpolate",

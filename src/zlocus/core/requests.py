@@ -447,6 +447,18 @@ def product_names(text: str) -> tuple[str, ...]:
     return tuple(name for name in PRODUCTS if name in names)
 
 
+def added_products(text: str) -> tuple[str, ...]:
+    """The maps of a surface: the default ones and the names of --products; none at all where that is `none`.
+
+    Raises
+    ------
+    ConfigError
+        A name that is not known.
+    """
+    names = product_names(text)
+    return names and tuple(name for name in PRODUCTS if name in {*DEFAULT_PRODUCTS, *names})
+
+
 def _check_products(names: Iterable[str]) -> None:
     for name in names:
         if name not in PRODUCTS:

@@ -124,13 +124,7 @@ def match_record(restored: Restored, xy: FloatArray, height_m: float, what_if: W
         raise GeometryError(why_not_shown(what_if)) from error
     report = PointReport.of("the cell", place_curves, match_scene, run.scene.crs)
     images = image_records(place_curves, loci(place_curves.views, report))
-    undulation_m = float(run.undulation(xy[None])[0])
-    report = replace(
-        report,
-        heights_m=report.heights_m - undulation_m,
-        peak_m=report.peak_m - undulation_m,
-        xyz=report.xyz - (0.0, 0.0, undulation_m),
-    )
+    report = report.above(float(run.undulation(xy[None])[0]))
     curves, options = report.curves, config.selection
     return {
         **point_record(report, options),

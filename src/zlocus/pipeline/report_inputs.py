@@ -243,11 +243,13 @@ def curves_of(
     match_scene = run.match_scene
     asked = f"The cell at row {chosen_cell.row}, column {chosen_cell.col}"
     looked = curves_at(asked, None, match_scene, place_of_cell(xy, height_m, run), config, SHOWN_WITHIN_CELLS)
-    report = PointReport.of(asked, looked, match_scene, run.scene.crs)
+    undulation_m = float(run.undulation(xy[None])[0])
+    report = PointReport.of(asked, looked, match_scene, run.scene.crs).above(undulation_m)
     # Where no height was found, all images are shown.
     n_images = len(report.search) if chosen_cell.kind == FAILED else report.curves.n_used
     drawing = mean_svg(report, n_images)
-    return {"point": point_record(report, config.selection), "n_shown": n_images, "svg": drawing}
+    record = {"point": point_record(report, config.selection), "n_shown": n_images, "svg": drawing}
+    return record | {"undulation_m": round(undulation_m, 4)}
 
 
 def place_of_cell(xy: FloatArray, height_m: float, run: ReportedRun) -> Place:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,15 @@ class PointReport:
             heights_m=place_curves.heights_m, curves=curves, step_m=match_scene.height_step,
             peak_m=match_scene.height_origin + curves.peak_index * match_scene.height_step,
         )  # fmt: skip
+
+    def above(self, undulation_m: float) -> PointReport:
+        """The report with heights above a vertical datum, which lies so far (m) above the ellipsoid."""
+        return replace(
+            self,
+            heights_m=self.heights_m - undulation_m,
+            peak_m=self.peak_m - undulation_m,
+            xyz=self.xyz - (0.0, 0.0, undulation_m),
+        )
 
     @property
     def reference(self) -> str:

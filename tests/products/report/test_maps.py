@@ -13,8 +13,10 @@ from affine import Affine
 
 from surveys import small
 from zlocus.core.grid import CellWindow
+from zlocus.core.options import ProductOptions
 from zlocus.matching.quality import Quality
 from zlocus.pipeline.report_inputs import sample_cores
+from zlocus.products.contours import write_contours
 from zlocus.products.demo_figure import relief
 from zlocus.products.hillshade import hillshade
 from zlocus.products.report import maps, tables
@@ -74,7 +76,7 @@ def test_the_relief_has_the_light_of_the_hillshade():
 )
 def test_ticks_of_heights_lie_evenly_between_the_percentiles(tmp_path, low, high, ticks):
     write(tmp_path / "dsm.tif", np.tile(np.linspace(low, high, 201), (9, 1)).astype(np.float32))
-    _, scale = maps.height_map(tmp_path, small(np.zeros((9, 201), np.uint16)), SUN)
+    _, scale = maps.height_map(tmp_path / "dsm.tif", small(np.zeros((9, 201), np.uint16)), SUN)
     assert " ".join(scale.ticks) == ticks
     assert scale.gradient.split(", ")[0] == "#440154"
 
@@ -207,20 +209,45 @@ def test_a_scene_smaller_than_all_places_is_one_place():
     assert len(sample_cores(scene_with(xy), 64, 117)) == 9
 
 
-def card(kind: str, why: str, rho1: float) -> list[str]:
+def card(kind: str, why: str, rho1: float, **more: float) -> list[str]:
     mean = {"label": 1, "rho1": rho1, "ratio": 2.0, "peak_m": 12.0}
     cell = {
         "kind": kind, "why": why, "row": 1, "col": 2, "x": 3.0, "y": 4.0, "height_m": None, "sigma_m": None,
         "quality": int(Quality.NO_MATCH), "n_shown": 1, "svg": "<svg/>", "point": {"reference": "a", "means": [mean]},
+        **more,
     }  # fmt: skip
     run = {"heights": {"searched_m": [1.25, 99.0]}, "config": {"options": {"checks": {"min_ncc": -0.2}}}}
     return curve_card(cell, run)["lines"]
+
+
+def contours_of_a_plane(folder: Path) -> maps.Picture | None:
+    """Contours, 4 m apart, of a plane that rises by 1 m per cell to the east."""
+    surface = write(folder / "dsm.tif", np.tile(np.arange(40, dtype=np.float32), (20, 1)))
+    write_contours(surface, folder / "contours.gpkg", ProductOptions(contour_interval_m=4.0))
+    return maps.contour_map(folder / "contours.gpkg", surface, SUN)
+
+
+def test_contours_are_drawn_where_they_lie(tmp_path):
+    pixels = pixels_of(contours_of_a_plane(tmp_path))
+    grow = pixels.shape[1] // 40
+    is_line = pixels[pixels.shape[0] // 2, :, 0].astype(int) < 120
+    starts = np.flatnonzero(np.diff(is_line.astype(int)) == 1) + 1
+    widths = np.array([np.flatnonzero(~is_line[start:])[0] for start in starts])
+    # The centre of the cell with 4 m is 4.5 cells from the edge, and that with 0 m half a cell.
+    np.testing.assert_allclose((starts + widths / 2) / grow, np.arange(0, 40, 4) + 0.5, atol=2 / grow)
+    assert np.flatnonzero(widths > widths.min()).tolist() == [0, 5]  # 0 m and 20 m
+
+
+def test_too_many_contours_are_not_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(maps, "MAX_DRAWN_CONTOURS", 1)
+    assert contours_of_a_plane(tmp_path) is None
 
 
 def test_a_failed_cell_with_a_high_peak_says_why_it_has_no_height():
     (said,) = (line for line in card("failed", "NO_MATCH", 0.97) if line.startswith("No height in spite of the peak"))
     assert "below -0.2 (checks.min_ncc)" in said
     assert "1.2 to 99.0 m" in card("failed", "RANGE_END", 0.97)[-1]
+    assert "-48.8 to 49.0 m" in card("failed", "RANGE_END", 0.97, undulation_m=50.0)[-1]
     assert not any("in spite" in line for line in card("failed", "NO_MATCH", 0.3))
     assert not any("in spite" in line for line in card("doubtful", "WEAK", 0.97))
 

@@ -118,7 +118,14 @@ def test_the_page_has_every_section_with_its_heading_and_a_way_to_it(made):
     parsed = page_of(made)
     assert [each["id"] for each in parsed.of("section")] == SECTIONS
     assert [each["aria-labelledby"] for each in parsed.of("section")] == [each["id"] for each in parsed.of("h2")]
-    assert {each["href"] for each in parsed.of("a")} == {f"#{name}" for name in SECTIONS}
+    links = {each["href"] for each in parsed.of("a")}
+    assert {link for link in links if link.startswith("#")} == {f"#{name}" for name in SECTIONS}
+    files = {link for link in links if not link.startswith("#")}
+    assert (
+        {"dsm.tif", "quality.tif", "hillshade.tif", "run.json"}
+        <= files
+        == {each for each in files if (made / each).exists()}
+    )
     assert len(parsed.of("h1")) == 1
     assert all(each["alt"] for each in parsed.of("img"))
     assert all("scope" in each for each in parsed.of("th"))
@@ -263,6 +270,43 @@ def test_curves_of_typical_cells_peak_at_their_heights(made):
     cards = page_of(made).text("curves")
     assert cards.count("Typical: ") == 3
     assert f"{typical[0]['height_m']:.2f} m" in cards
+
+
+def test_heights_of_the_curves_have_the_vertical_datum_of_the_surface(images, tmp_path):
+    scene = images("sine")
+    geoid = tmp_path / "geoid.tif"
+    profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "crs": "EPSG:4326", "width": 4, "height": 4}
+    with rasterio.open(geoid, "w", **profile, transform=Affine(90.0, 0, -180.0, 0, -45.0, 90.0)) as file:
+        file.write(np.full((4, 4), UNDULATION_M, np.float32), 1)
+    out = run(
+        scene,
+        tmp_path / "out",
+        SMALL_TILES,
+        report=True,
+        vertical=str(geoid),
+        heights=tuple(z - UNDULATION_M for z in HEIGHTS),
+    ).out
+    typical = [cell for cell in json.loads((out / "curves.json").read_text())["cells"] if cell["kind"] == TYPICAL]
+    height, _ = read(out / "dsm.tif")
+    for cell in typical:
+        step_m = cell["point"]["step_m"]
+        assert abs(cell["point"]["peak_m"] - height[cell["row"], cell["col"]]) < 3 * step_m < UNDULATION_M / 10
+        assert cell["undulation_m"] == pytest.approx(UNDULATION_M)
+    text = page_of(out).text("curves")
+    assert "above the geoid of geoid.tif" in text
+    assert "ellipsoid" not in text
+
+
+def test_terrain_and_contours_are_shown_where_they_are_made(made, out):
+    assert "terrain" not in {each["id"] for each in page_of(made).of("section")}
+    assert zl("products", out, "--products", "dtm,contours", "--set", "products.contours_of=dtm").exit_code == 0
+    changed(out, "run.json", lambda record: record["config"]["options"]["products"].update(contours_of="dtm"))
+    write_report(out)
+    parsed = page_of(out)
+    assert "Contours of the terrain" in parsed.text("terrain")
+    links = {each["href"] for each in parsed.of("a")}
+    assert {"#terrain", "dtm.tif", "contours.gpkg"} <= links
+    assert sum("Contours" in each["alt"] for each in parsed.of("img")) == 1
 
 
 def test_names_that_are_code_do_not_run(out):

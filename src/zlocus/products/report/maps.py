@@ -16,6 +16,7 @@ from rasterio.enums import Resampling
 from zlocus.io.open_raster import open_raster
 from zlocus.matching.quality import Quality
 from zlocus.products.demo_figure import error_map, relief
+from zlocus.products.hillshade import hillshade
 from zlocus.products.report.sampling import Survey
 from zlocus.products.report.text import percent, size
 
@@ -48,6 +49,12 @@ FLAG_GROUPS: tuple[tuple[str, Quality, tuple[int, int, int]], ...] = (
     ("height of a fitted plane (PLANE)", Quality.PLANE, (0, 158, 115)),
     ("height with another note (JUMP, UNREFINED, IMAGE_EXCLUDED)", Quality(0xFFFF), (240, 228, 66)),
 )
+# Contours: brown lines on pale grey relief; every so many multiples of the interval one is thick. More lines than this
+# are not drawn, for they would hide the map.
+CONTOUR_LAYER, CONTOUR_COLOUR, INDEX_EVERY, MAX_DRAWN_CONTOURS = "contours", (20, 60, 130), 5, 20_000
+PALEST, PALENESS = np.float32(250.0), np.float32(0.45)
+# Fractions of a pixel in OpenCV's coordinates of lines.
+SHIFT_BITS = 4
 TWO_BITS = (Quality.MASKED, Quality.WATER)
 ERROR_ALT = "Error of height: red where the surface is too high, blue where it is too low; white where it is not known."
 NO_FLAG = ("height without a warning", (225, 225, 225))
@@ -92,14 +99,43 @@ class Swatch:
     share: str
 
 
-def height_map(folder: Path, survey: Survey, sun_deg: tuple[float, float]) -> tuple[Picture, Scale]:
-    """Map of the heights as colours with relief shading. sun_deg : azimuth and altitude of the sun."""
-    height, cell_m = averaged(folder / "dsm.tif", RELIEF_PX)
+def height_map(raster: Path, survey: Survey, sun_deg: tuple[float, float]) -> tuple[Picture, Scale]:
+    """Map of heights, of the surface or the terrain, as colours with relief shading. sun_deg : azimuth and altitude of
+    the sun."""
+    height, cell_m = averaged(raster, RELIEF_PX)
     low, high = span(height)
     shaded = relief(height, cell_m, (low, high), sun_deg)
     scale = Scale(f"{survey.height_name}, m", viridis(), even_ticks(low, high))
     alt = f"Shaded relief coloured by height from {low:.1f} to {high:.1f} m; white where there is no height."
     return picture(shaded, alt), scale
+
+
+def contour_map(contours: Path, raster: Path, sun_deg: tuple[float, float]) -> Picture | None:
+    """Map of contours on the grey relief of the heights from which they were drawn; None where they are too many.
+
+    Every fifth height has a thick line. contours : GeoPackage of the product; raster : of those heights.
+    """
+    import pyogrio
+    import shapely
+
+    if pyogrio.read_info(contours, layer=CONTOUR_LAYER)["features"] > MAX_DRAWN_CONTOURS:
+        return None
+    _, _, geometry, (level_m,) = pyogrio.raw.read(contours, layer=CONTOUR_LAYER, columns=["elevation_m"])
+    height, cell_m = averaged(raster, RELIEF_PX)
+    grow = max(1, MAP_PX // max(height.shape))
+    grey = cv2.cvtColor(hillshade(height, cell_m, *sun_deg), cv2.COLOR_GRAY2BGR)
+    grey = np.where(np.isfinite(height)[..., None], PALEST - (255 - grey.astype(np.float32)) * PALENESS, 255.0)
+    canvas = np.asarray(cv2.resize(np.rint(grey).astype(np.uint8), None, fx=grow, fy=grow))
+    with open_raster(raster, "raster") as file:
+        to_pixels = file.transform.scale(height.shape[1] / file.width, height.shape[0] / file.height) * ~file.transform
+    levels = np.unique(level_m)
+    interval_m = float(np.diff(levels).min(initial=np.inf))  # of neighbouring levels, none of which is left out
+    for line, level in zip(shapely.from_wkb(geometry), level_m, strict=True):
+        x, y = to_pixels * tuple(shapely.get_coordinates(line).T)
+        points = np.rint(np.column_stack([x, y]) * grow * (1 << SHIFT_BITS)).astype(np.int32)
+        is_index = np.isfinite(interval_m) and round(level / interval_m) % INDEX_EVERY == 0
+        cv2.polylines(canvas, [points], False, CONTOUR_COLOUR, 2 if is_index else 1, cv2.LINE_AA, SHIFT_BITS)
+    return picture(canvas, "Contours on a grey relief of the heights from which they were drawn.")
 
 
 def ortho_map(folder: Path) -> Picture | None:

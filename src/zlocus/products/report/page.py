@@ -19,12 +19,15 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.io.run_record import read_record
 from zlocus.matching.quality import Quality, flags_of
 from zlocus.products.acquisitions import COLUMNS, acquisition_rows
+from zlocus.products.derived import FILES
 from zlocus.products.match_curve_drawing import SVG_PX
 from zlocus.products.ortho_colours import colour_sentence
 from zlocus.products.report import maps, tables
 from zlocus.products.report import text as words
+from zlocus.products.report.command_line import command_line
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.report.sampling import Survey, survey_rasters
+from zlocus.products.stac_item import PRODUCTS
 
 if TYPE_CHECKING:
     from zlocus.evaluation.comparison import Comparison
@@ -57,6 +60,14 @@ class Outline:
     points: str
     colour: str
     at: tuple[float, float] | None
+
+
+class FileRow(NamedTuple):
+    """A file of the result. size : in words."""
+
+    name: str
+    title: str
+    size: str
 
 
 def write_report(out: Path, comparison: Comparison | None = None) -> Path:
@@ -114,7 +125,9 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
         "title": out.resolve().name, "version": run["versions"]["zlocus"], "summary": paragraph, "where": where,
         "frame": frame, "is_local": is_local(crs), "run": run, "survey": survey,
         "footprints": footprints_part(out / FOOTPRINTS, survey, crs, list(views)),
-        "heights": maps.height_map(out, survey, sun_deg), "sun": words.sun(*sun_deg),
+        "command": command_line(run), "started_in": run.get("started_in", ""), "files": file_rows(out),
+        "heights": maps.height_map(out / "dsm.tif", survey, sun_deg), **derived_maps(out, survey, light, sun_deg),
+        "sun": words.sun(*sun_deg),
         "corners": words.corners(survey, is_local(crs)), "bar": maps.scale_bar(survey.shape[1] * survey.cell_m),
         "ortho": maps.ortho_map(out), "colours": colour_sentence(run.get("colours", {})),
         "created": words.when(run.get("created")),
@@ -128,6 +141,37 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
         "reference": reference, "stages": tables.stage_rows(run["stages"]),
         "request": tables.request_rows(run["config"]["request"]),
         "options": tables.option_rows(run["config"]["options"]),
+    }  # fmt: skip
+
+
+def file_rows(out: Path) -> list[FileRow]:
+    """The files of a result, in the order of its catalogue item, which is written after the report."""
+    return [
+        FileRow(product.name, product.title, _size_words((out / product.name).stat().st_size))
+        for product in PRODUCTS
+        if product.name != REPORT and (out / product.name).is_file()
+    ]
+
+
+def _size_words(size: int) -> str:
+    """A number of bytes in words."""
+    return f"{size / 1e6:.3g} MB" if size >= 1e5 else f"{max(size / 1e3, 0.1):.2g} kB"
+
+
+def derived_maps(out: Path, survey: Survey, light: Mapping[str, Any], sun_deg: tuple[float, float]) -> dict[str, Any]:
+    """Maps of the terrain and of the contours, None without; `contours_note` says of what, or why they are not drawn.
+
+    light : options of the products.
+    """
+    terrain, contours = out / FILES["dtm"], out / FILES["contours"]
+    drawn_from = terrain if light["contours_of"] == "dtm" and terrain.exists() else out / "dsm.tif"
+    shown = maps.contour_map(contours, drawn_from, sun_deg) if contours.exists() else None
+    note = f"Contours of the {'terrain' if drawn_from == terrain else 'surface'}, one in five thick."
+    if contours.exists() and shown is None:
+        note = f"{FILES['contours']} holds more lines than a map of this size can show."
+    return {
+        "terrain": maps.height_map(terrain, survey, sun_deg) if terrain.exists() else None,
+        "contours": shown, "contours_note": note if contours.exists() else "",
     }  # fmt: skip
 
 
@@ -301,6 +345,8 @@ def curve_card(cell: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any
     uri = maps.data_uri(cell["svg"].encode(), "image/svg+xml")
     alt = f"Correlation against height at this cell. {says}"
     lines.append(says)
-    if cell["kind"] == "failed" and (despite := words.despite_peak(Quality[cell["why"]], mean["rho1"], run)):
-        lines.append(despite)
+    if cell["kind"] == "failed":
+        undulation_m = cell.get("undulation_m", 0.0)
+        despite = words.despite_peak(Quality[cell["why"]], mean["rho1"], run, undulation_m)
+        lines += [despite] if despite else []
     return card | {"lines": lines, "picture": maps.Picture(uri, alt, *SVG_PX)}

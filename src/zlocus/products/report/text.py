@@ -191,11 +191,14 @@ def corners(survey: Survey, is_local: bool) -> list[str]:
     ]
 
 
-def despite_peak(flag: Quality, rho1: float | None, run: Mapping[str, Any]) -> str:
-    """Why a cell is empty although its mean curve has a high peak, as a sentence; "" where the peak is not high."""
+def despite_peak(flag: Quality, rho1: float | None, run: Mapping[str, Any], undulation_m: float = 0.0) -> str:
+    """Why a cell is empty although its mean curve has a high peak, as a sentence; "" where the peak is not high.
+
+    undulation_m : height of the surface's vertical datum above the ellipsoid at the cell.
+    """
     if rho1 is None or rho1 < HIGH_PEAK or flag not in DESPITE_PEAK:
         return ""
-    low, high = run["heights"]["searched_m"]
+    low, high = (z - undulation_m for z in run["heights"]["searched_m"])
     text = DESPITE_PEAK[flag].format(min_ncc=run["config"]["options"]["checks"]["min_ncc"], low=low, high=high)
     return f"No height in spite of the peak: {text}."
 
