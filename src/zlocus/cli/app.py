@@ -98,7 +98,7 @@ def command_name(words: Sequence[str]) -> str:
 
 # What the library says of a value that cannot be used, and what we say.
 WRONG_VALUES = {
-    r"Input should be a valid integer.*|'.*' is not a valid integer\.": "a whole number is needed",
+    r"Input should be a valid integer.*|'.*' is not a valid int(eger)?\.": "a whole number is needed",
     r"Input should be a valid number.*|'.*' is not a valid float\.": "a number is needed",
     r"Input should be less than or equal to (\S+)": r"it must be \1 at most",
     r"Input should be greater than or equal to (\S+)": r"it must be \1 or more",
