@@ -149,6 +149,17 @@ def flags(results: AllResults) -> str:
     return markdown(head, lines)
 
 
+@table("trusted")
+def trusted(results: AllResults) -> str:
+    """What the recipe for trusted heights keeps of the right heights, and how many of the kept ones are wrong."""
+    it, recipe = of_row(results, "flags"), "sigma below two cells"
+    labels = [f.what.partition(", wrong heights")[0] for f in it.figures if f.what.endswith(", wrong heights")]
+    whats = ("{}, wrong heights", "{}, {}: wrong heights among the kept", "{}, {}: right heights kept")
+    lines = [[label, *(f"{it.value(what.format(label, recipe)):.1%}" for what in whats)] for label in labels]
+    head = ["scenes", "wrong before", "wrong among the kept heights", "right heights that are kept"]
+    return markdown(head, lines)
+
+
 @table("troubles")
 def troubles(results: AllResults) -> str:
     """Painted troubles: share of the cells with a height, and of these heights those off by more than 3 and 10 m."""
