@@ -40,6 +40,7 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     from zlocus.io.open_raster import existing_file
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import FILES, link_all, write_derived
+    from zlocus.products.report.file_names import REPORT
 
     existing_file(options.out / "dsm.tif", "surface")
     if options.config is None:
@@ -51,7 +52,8 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     link_all(options.out, progress)
     update_finished(options.out, (*(FILES[name] for name in chosen), ITEM))
     made = [FILES[name] for name in chosen]
-    return Answer(f"{options.out}: {', '.join(made) or 'no map'} made.", {"products": made})
+    shown = f" `zlocus report {options.out}` shows them." if made and (options.out / REPORT).exists() else ""
+    return Answer(f"{options.out}: {', '.join(made) or 'no map'} made.{shown}", {"products": made})
 
 
 def run_options(record: Path, settings: Sequence[str]) -> ProductOptions:
