@@ -36,6 +36,7 @@ RUN_BY = {
     "peers/realistic.py": "test_realistic_scenes.py::test_scenes_of_seeds_are_rendered_and_judged",
     "peers/verdicts.py": "test_realistic_scenes.py::test_the_heaviest_loss_comes_first_with_its_reason",
     "rows/realistic.py": "test_realistic_scenes.py::test_how_hard_the_recipe_is_for_others",
+    "rows/flags.py": "test_surfaces.py::test_what_a_warning_is_worth_is_counted",
     "rows/clouds.py": "test_realistic_scenes.py::test_a_cloud_is_masked_and_judged",
     "rows/troubles.py": "test_realistic_scenes.py::test_a_trouble_is_matched_and_judged",
     "middlebury.py": "test_acceptance.py::test_the_benchmark_of_rectified_photographs",

@@ -22,11 +22,12 @@ import spaces
 import terrain
 import terrain_features
 from benchmark_scripts import printed_table, run_script, share_of
-from rows import standard_deviations
+from rows import flags, standard_deviations
 from workplace import CannotRun
 from zlocus.io.scene_file import open_scene
 from zlocus.matching import precision_calibration as calibration
 from zlocus.matching import tile
+from zlocus.matching.quality import Quality
 
 # Share of the cells of the small town within 1 m of the truth. Methods reach .87 and more; much less is a fault of a
 # benchmark.
@@ -182,6 +183,31 @@ def test_shares_within_sigma_by_recipe():
     is_large = np.abs(judged.error_m) > 1
     expected = 20 / is_large.sum()
     assert figures["errors above 1 m in the tenth with the largest sigma, least"] == expected < 1
+
+
+def test_what_a_warning_is_worth_is_counted(small_town, small_surface):
+    """Of 1000 heights, 200 are wrong; JUMP marks 150 of these and 100 right ones; water has no warning."""
+    error, quality = np.repeat([0.5, 3.0], (800, 200)), np.zeros(1000, np.uint16)
+    quality[700:950] = Quality.JUMP
+    quality[:300] = Quality.WATER
+    sigma = np.repeat([0.1, 1.0, 4.0], (100, 800, 100))
+    made_up = flags.FlaggedHeights(error, sigma, quality)
+    found = {figure.what: figure.value for figure in flags.figures_of("hills", [made_up, made_up])}
+    assert found["hills, wrong heights"] == 0.2
+    assert found["hills, heights off by more than 3 sigma"] == 0.1
+    assert found["hills, JUMP: marked, wrong"] == 0.6
+    assert found["hills, JUMP: of the wrong heights"] == 0.75
+    assert found["hills, JUMP: of the right heights"] == 0.125
+    assert "hills, PLANE: marked, wrong" not in found
+    assert found["hills, sigma below two cells: right heights kept"] == 1.0
+    assert found["hills, sigma below two cells: wrong heights among the kept"] == pytest.approx(100 / 900)
+
+    _, xy, errors = precision.errors_of(small_town, small_surface / "dsm.tif")
+    real = flags.flagged(small_surface, xy, errors)
+    assert len(real.quality) == np.isfinite(errors).sum()
+    with rasterio.open(small_surface / "quality.tif") as file:
+        k = int(np.flatnonzero(np.isfinite(errors))[0])
+        assert real.quality[0] == next(file.sample([xy[k]]))[0]
 
 
 def terrain_rows(text: str) -> dict[str, list[float]]:
