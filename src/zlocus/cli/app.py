@@ -15,6 +15,7 @@ import typer
 
 from zlocus import __version__
 from zlocus.cli.answer import Answer
+from zlocus.cli.align import AlignOptions, align
 from zlocus.cli.cloud import CloudOptions, cloud
 from zlocus.cli.commands import Command, command_of
 from zlocus.cli.compare import CompareOptions, compare
@@ -55,6 +56,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("doctor", DoctorOptions, doctor),
     ("import", ImportOptions, import_cameras),
     ("evaluate", EvaluateOptions, evaluate),
+    ("align", AlignOptions, align),
     ("compare", CompareOptions, compare),
     ("report", ReportOptions, report),
     ("inspect", InspectOptions, inspect),

@@ -10,8 +10,9 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
+from zlocus.cli.point_options import POINT_FILES, POINTS, PointFileOptions, check_for_points
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.core.requests import EVALUATION_FILES, check_output
+from zlocus.core.requests import EVALUATION_FILES, POINT_EVALUATION_FILES, check_output
 
 DEFAULT_THRESHOLD_M = 1.0
 # In the module of slopes too, which is slow to import.
@@ -78,11 +79,23 @@ class ComparisonOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(ComparisonOptions):
+class EvaluateOptions(PointFileOptions, ComparisonOptions):
     """Arguments and options of `zlocus evaluate`."""
 
     dsm: Annotated[Path, typer.Argument(help="Surface to be evaluated.", metavar="DSM")]
-    reference: Annotated[Path, typer.Argument(help="Reference heights.", metavar="REFERENCE")]
+    references: Annotated[
+        list[Path],
+        typer.Argument(
+            help=f"Reference heights: a raster, points ({POINT_FILES}), or several clouds.", metavar="REFERENCE"
+        ),
+    ]
+    vegetated: Annotated[
+        str | None,
+        typer.Option(
+            help="Kinds of ground of points that are vegetated, or none. Default: by their usual names.",
+            metavar="NAME,NAME...", rich_help_panel=POINTS,
+        ),
+    ] = None  # fmt: skip
     out: Annotated[
         Path | None,
         typer.Option(
@@ -98,17 +111,23 @@ class EvaluateOptions(ComparisonOptions):
 
 
 def evaluate(options: EvaluateOptions, console: Console) -> Answer:
-    """Compare a surface with a reference surface."""
+    """Compare a surface with a reference surface, or with points."""
     arguments = options.arguments()
     if options.out is not None:
-        check_not_input(options.out, options.dsm, options.reference, options.classes, options.geoid)
-        check_output(options.out, options.overwrite, EVALUATION_FILES, "evaluation")
+        check_not_input(options.out, options.dsm, *options.references, options.classes, options.geoid)
+        names = tuple(dict.fromkeys([*EVALUATION_FILES, *POINT_EVALUATION_FILES]))
+        check_output(options.out, options.overwrite, names, "evaluation")
+    from zlocus.io.points.open_points import are_points
+
+    if are_points(options.references):
+        return _at_points(options, arguments, console)
+    check_for_points([*options.given(), *["--vegetated"] * (options.vegetated is not None)], str(options.references[0]))
     from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate as compare
     from zlocus.evaluation.files import write_evaluation
     from zlocus.evaluation.table import evaluation_table, main_figures_line
 
-    comparison = Comparison(options.reference, **arguments)
+    comparison = Comparison(options.references[0], **arguments)
     with console.progress.stage("Comparing"):
         evaluation = compare(options.dsm, comparison)
     if evaluation.nothing_compared is not None:
@@ -121,6 +140,26 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     return Answer(f"{text}\n{options.out}: {', '.join(EVALUATION_FILES)} written.", {**values, "files": files}, True)
 
 
+def _at_points(options: EvaluateOptions, arguments: dict[str, Any], console: Console) -> Answer:
+    """Compare a surface with points."""
+    point_options = options.point_options(options.vegetated)
+    from zlocus.evaluation.comparison import Comparison
+    from zlocus.evaluation.files import write_point_evaluation
+    from zlocus.evaluation.point_evaluation import evaluate_at_points
+    from zlocus.evaluation.point_table import point_table
+    from zlocus.evaluation.table import main_figures_line
+
+    comparison = Comparison(options.references[0], **arguments)
+    with console.progress.stage("Comparing"):
+        found = evaluate_at_points(options.dsm, comparison, point_options, options.references[1:])
+    text, values = f"{point_table(found)}\n{main_figures_line(found.evaluation)}", found.as_dict()
+    if options.out is None:
+        return Answer(text, values, is_asked_for=True)
+    names = write_point_evaluation(options.out, found)
+    files = [str(options.out / name) for name in names]
+    return Answer(f"{text}\n{options.out}: {', '.join(names)} written.", {**values, "files": files}, True)
+
+
 def check_not_input(out: Path, *inputs: Path | None) -> None:
     """Refuse to write over a raster that is to be read.
 
@@ -130,7 +169,11 @@ def check_not_input(out: Path, *inputs: Path | None) -> None:
         An input is one of the files that the evaluation writes.
     """
     for path in inputs:
-        if path is not None and path.name in EVALUATION_FILES and path.resolve().parent == out.resolve():
+        if (
+            path is not None
+            and path.name in (*EVALUATION_FILES, *POINT_EVALUATION_FILES)
+            and path.resolve().parent == out.resolve()
+        ):
             raise ConfigError(f"{path} would be written over. Choose another folder with -o.")
 
 

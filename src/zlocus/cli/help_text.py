@@ -44,6 +44,11 @@ EXAMPLES = {
     "evaluate": """
         zlocus evaluate surface/dsm.tif reference.tif
         zlocus evaluate surface/dsm.tif srtm.tif --geoid egm96 --align -o judged
+        zlocus evaluate surface/dsm.tif check_points.csv --points-crs EPSG:25832 --points-sigma 0.02
+        """,
+    "align": """
+        zlocus align surface laser.laz -o aligned
+        zlocus align surface atl08.csv -o aligned --tilt
         """,
     "compare": "zlocus compare surface other -o comparison",
     "report": "zlocus report surface --reference reference.tif",

@@ -504,4 +504,6 @@ def check_output(
 
 # Beside a run, which has no file of these names, there is room for them.
 EVALUATION_FILES = ("evaluation.json", "error.tif", "histogram.png")
+# Of points: in place of the map, each point with its error.
+POINT_EVALUATION_FILES = ("evaluation.json", "points.csv", "histogram.png")
 COMPARISON_FILES = ("compare.html", "difference.tif")

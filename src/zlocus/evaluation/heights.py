@@ -10,7 +10,9 @@ import numpy as np
 import pyproj
 from affine import Affine
 from pyproj.exceptions import CRSError
+from rasterio import DatasetReader
 from rasterio.crs import CRS
+from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
@@ -142,19 +144,30 @@ def read_heights(path: Path) -> HeightRaster:
         The file is missing or cannot be read, is too small for a surface, or its unit is not the metre.
     """
     with open_raster(path, "raster of heights") as source:
-        stored, nodata, transform, crs = source.read(1), source.nodata, source.transform, source.crs
-        scale, offset, description = source.scales[0], source.offsets[0], source.descriptions[0] or ""
         check_unit(source.units[0], path)
-    if stored.dtype.kind == "c":
-        raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        z = stored.astype(np.float64)
+        z = read_window(source, path)
+        transform, crs, description = source.transform, source.crs, source.descriptions[0] or ""
     if min(z.shape) < 2:
         raise InputError(f"{path} has {z.shape[0]} x {z.shape[1]} cells, too few for a surface. Check the file.")
-    if nodata is not None:
-        z[z == nodata] = np.nan
-    z[is_fill(z)] = np.nan
-    if (scale, offset) != (1.0, 0.0):
-        z = z * scale + offset
-    z[(z < MIN_HEIGHT_M) | (z > MAX_HEIGHT_M)] = np.nan
     return HeightRaster(path, z, transform, crs, description)
+
+
+def read_window(source: DatasetReader, path: Path, window: Window | None = None) -> FloatArray:
+    """Heights (r, c) m of the first band of an open raster, or of a window of it; NaN where there is none.
+
+    Raises
+    ------
+    InputError
+        The band holds complex numbers.
+    """
+    if np.dtype(source.dtypes[0] if "complex_int" not in source.dtypes[0] else "complex64").kind == "c":
+        raise InputError(f"{path} holds complex numbers, which are no heights. Check the file.")
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        z = source.read(1, window=window).astype(np.float64)
+    if source.nodata is not None:
+        z[z == source.nodata] = np.nan
+    z[is_fill(z)] = np.nan
+    if (source.scales[0], source.offsets[0]) != (1.0, 0.0):
+        z = z * source.scales[0] + source.offsets[0]
+    z[(z < MIN_HEIGHT_M) | (z > MAX_HEIGHT_M)] = np.nan
+    return np.asarray(z)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.evaluate import Evaluation
@@ -27,11 +28,18 @@ def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = 
     The median is marked, and so are the limits of `within` where they lie inside the axis. The main errors are drawn;
     the title gives the figures of the others.
     """
+    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
+    return errors_figure(evaluation, evaluation.error_map.errors, size_inches)
+
+
+def errors_figure(
+    evaluation: Evaluation, all_errors: NDArray[np.floating], size_inches: tuple[float, float] = SIZE_INCHES,
+    places: str = "cells",
+) -> Figure:  # fmt: skip
+    """The figure of `histogram_figure`. all_errors : main errors of any shape, m; places : what each is of."""
     from matplotlib.figure import Figure
 
-    assert evaluation.error_map is not None, "an evaluation of files has a map of errors"
-    known = np.isfinite(evaluation.error_map.errors)
-    errors = evaluation.error_map.errors[known].astype(np.float64)
+    errors = all_errors[np.isfinite(all_errors)].astype(np.float64)
     figure = Figure(figsize=size_inches, layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel("height of the surface less that of the reference, m")
@@ -40,7 +48,7 @@ def histogram_figure(evaluation: Evaluation, size_inches: tuple[float, float] = 
         _draw(axes, errors, evaluation.statistics, evaluation.threshold_m)
     else:
         axes.text(0.5, 0.5, "no height where the reference has one", ha="center", transform=axes.transAxes)
-    axes.set_title(_title(evaluation), loc="left", fontsize=10)
+    axes.set_title(_title(evaluation, places), loc="left", fontsize=10)
     return figure
 
 
@@ -61,7 +69,7 @@ def differences_figure(
     return figure
 
 
-def _title(evaluation: Evaluation) -> str:
+def _title(evaluation: Evaluation, places: str) -> str:
     """Completeness, which errors are drawn, and the figures of both kinds of errors beside each other."""
     complete = f"{100 * evaluation.statistics.completeness:.1f} %"
     if complete == "100.0 %" and evaluation.statistics.completeness < 1:
@@ -71,9 +79,8 @@ def _title(evaluation: Evaluation) -> str:
     beside = figures[other]
     statistics = None if beside is None else beside.statistics
     there = "not known" if statistics is None else f"median {statistics.median:+z.3f} m, NMAD {statistics.nmad:.3f} m"
-    return (
-        f"{complete} of {evaluation.statistics.n} cells have a height; drawn: {drawn} errors\n{other} errors: {there}"
-    )
+    have = f"{complete} of {evaluation.statistics.n} {places} have a height"
+    return f"{have}; drawn: {drawn} errors\n{other} errors: {there}"
 
 
 def _draw(

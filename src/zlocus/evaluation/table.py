@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from zlocus.evaluation.accuracy import Accuracy
+from zlocus.evaluation.coregistration import METHOD as COREGISTERED
 from zlocus.evaluation.evaluate import Evaluation
 from zlocus.evaluation.mvs3dm import Mvs3dm
-from zlocus.evaluation.shift import SEARCH, Shift
+from zlocus.evaluation.shift import Shift
 from zlocus.evaluation.slopes import UNKNOWN
 from zlocus.evaluation.statistics import ErrorStatistics
 
@@ -40,9 +41,9 @@ def evaluation_table(evaluation: Evaluation) -> str:
     Several thresholds have a table of their own below.
     """
     thresholds = _thresholds(evaluation)
-    lines = _text(accuracy_table(evaluation, thresholds[:1], TEXT_ERROR_COLUMNS))
+    lines = table_lines(accuracy_table(evaluation, thresholds[:1], TEXT_ERROR_COLUMNS))
     if len(thresholds) > 1:
-        lines += ["", *_text(accuracy_table(evaluation, thresholds, ()))]
+        lines += ["", *table_lines(accuracy_table(evaluation, thresholds, ()))]
     return "\n".join([*lines, *notes(evaluation)])
 
 
@@ -70,7 +71,7 @@ def _groups(accuracy: Accuracy) -> dict[str, ErrorStatistics]:
     return {"all": accuracy.statistics} | accuracy.class_statistics | bands
 
 
-def _text(table: AccuracyTable) -> list[str]:
+def table_lines(table: AccuracyTable) -> list[str]:
     """Lines of a table, under a line that names the two kinds of figures."""
     headings = (table.first_headings, table.kind_headings, table.kind_headings)
     parts = [_justified([heading, *(row[part] for row in table.rows)]) for part, heading in enumerate(headings)]
@@ -169,7 +170,7 @@ def main_figures_line(evaluation: Evaluation) -> str:
     if evaluation.shift is None:
         return f"{main} the absolute ones; --align or --coregister makes them the aligned ones"
     method = evaluation.shift.method
-    return f"{main} the aligned ones, because of {'--align' if method == SEARCH else f'--coregister {method}'}"
+    return f"{main} the aligned ones, because of {'--align' if method != COREGISTERED else f'--coregister {method}'}"
 
 
 def _mvs3dm_lines(evaluation: Evaluation) -> Iterator[str]:

@@ -178,6 +178,23 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
+def check_not_aligned(run: Mapping[str, Any], path: Path) -> None:
+    """Refuse a surface that was moved after the run: its images show its cells at other places.
+
+    run : content of run.json; path : of the file.
+
+    Raises
+    ------
+    InputError
+        The surface was aligned.
+    """
+    if "alignment" in run:
+        raise InputError(
+            f"{path} is of a surface that was moved by `zlocus align`, so that its cameras do not go with it any more. "
+            f"Give the surface as it was before, {run['alignment'].get('surface')}."
+        )
+
+
 def finite_only(value: Any) -> Any:
     """The value with every number that is not finite replaced by None, also inside tables and lists."""
     if isinstance(value, dict):

@@ -13,6 +13,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.io.config import config_from_dict
+from zlocus.io.run_record import check_not_aligned
 from zlocus.io.stored_files import is_remote
 
 # Fields of a request that name files. --vertical and --dem-vertical may name files, too.
@@ -55,8 +56,10 @@ def request_with(
     Raises
     ------
     InputError
-        run.json is not what such a run writes.
+        run.json is not what such a run writes, or its surface was moved since.
     """
+
+    check_not_aligned(run, record)
 
     def placed(path: str) -> str:
         return path if is_remote(Path(path)) else str(place(path))

@@ -16,7 +16,7 @@ from zlocus.core.errors import InputError
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
-from zlocus.io.run_record import read_record
+from zlocus.io.run_record import check_not_aligned, read_record
 from zlocus.matching.quality import Quality, flags_of
 from zlocus.products.acquisitions import COLUMNS, acquisition_rows
 from zlocus.products.derived import FILES
@@ -104,6 +104,7 @@ def rendered(values: Mapping[str, Any], template: str = "page.html.jinja") -> st
 def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
     """Values of the page's template."""
     run = run_record(out)
+    check_not_aligned(run, out / RECORD)
     survey, crs = survey_rasters(out), CRS.from_user_input(run["grid"]["crs"])
     if is_local(crs):
         survey = replace(survey, height_name="z of the local frame")
