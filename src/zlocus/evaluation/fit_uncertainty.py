@@ -23,24 +23,26 @@ def covariance_of(
     along the longer side; time_s : (n,) s, NaN where unknown.
 
     Residuals of one group may be correlated in any way, those of different groups are taken as independent (Liang and
-    Zeger 1986, Biometrika 73, eq. 5 and 6). Groups are the places themselves, areas of three sizes, and passes. Of
-    those with enough groups the covariance with the largest sum of variances counts: neighbours that err together then
-    raise it, whatever the length over which they do.
+    Zeger 1986, Biometrika 73, eq. 5 and 6), with the usual factor for few groups, g / (g - k). Groups are the places
+    themselves, areas of three sizes, and passes. Of those with enough groups, each unknown gets its largest variance:
+    neighbours that err together raise it, whatever the length over which they do.
     """
-    inverse = np.linalg.pinv(jacobian)
-    groupings = [np.arange(len(score)), *(areas(relative, n) for n in AREAS_PER_SIDE)]
-    if np.isfinite(time_s).all() and len(time_s):
+    inverse, (n_places, n_unknowns) = np.linalg.pinv(jacobian), score.shape
+    groupings = [np.arange(n_places), *(areas(relative, n) for n in AREAS_PER_SIDE)]
+    if n_places and np.isfinite(time_s).all():
         groupings.append(passes(time_s))
-    best, n_best = np.zeros_like(jacobian), 0
+    covariances, counts = [np.zeros_like(jacobian)], [0]
     for groups in groupings:
-        n = int(groups.max()) + 1 if len(groups) else 0
-        if n < min(MIN_GROUPS, len(score)) or n < 2:
+        n = int(groups.max()) + 1 if n_places else 0
+        if n < min(MIN_GROUPS, n_places) or n <= n_unknowns:
             continue
         sums = np.stack([np.bincount(groups, column, n) for column in score.T], axis=1)
-        covariance = inverse @ (sums.T @ sums) @ inverse.T * n / (n - 1)
-        if np.trace(covariance) > np.trace(best):
-            best, n_best = covariance, n
-    return best, n_best
+        covariances.append(inverse @ (sums.T @ sums) @ inverse.T * n / (n - n_unknowns))
+        counts.append(n)
+    variances = np.array([np.diag(covariance) for covariance in covariances])
+    largest = int(np.argmax(variances.sum(axis=1)))
+    factor = np.sqrt(variances.max(axis=0) / np.where(variances[largest] > 0, variances[largest], 1.0))
+    return covariances[largest] * np.outer(factor, factor), counts[largest]
 
 
 def areas(relative: FloatArray, per_side: int) -> NDArray[np.int64]:

@@ -65,7 +65,7 @@ def asprs_lines(found: PointEvaluation) -> Iterator[str]:
 
 def _vertical_line(name: str, accuracy: VerticalAccuracy) -> str:
     values = (accuracy.rmse_v1, accuracy.rmse_v2, accuracy.rmse_v, accuracy.le90)
-    return f"{name:<19} {accuracy.n_compared:>6}" + "".join(f"{_metres(value):>10}" for value in values)
+    return f"{name:<19} {accuracy.n_compared:>6}" + "".join(f" {_metres(value):>9}" for value in values)
 
 
 def _horizontal_lines(found: PointEvaluation) -> Iterator[str]:

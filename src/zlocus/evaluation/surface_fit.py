@@ -18,7 +18,7 @@ from zlocus.evaluation.relief import MAX_SLOPE, MIN_SLOPE_SPREAD
 
 # Number of points that each kind of fit needs at least.
 MIN_FOR_HEIGHT, MIN_FOR_TILT, MIN_FOR_SHIFT = 3, 10, 100
-CONVERGED_M, MAX_STEPS, WEIGHT_ROUNDS = 0.0005, 30, 4
+CONVERGED_M, MAX_STEPS, WEIGHT_ROUNDS = 0.0005, 30, 10
 # The search tries shifts on a grid of so many places to each side, with some of the points.
 SEARCH_STEPS, SEARCH_POINTS = 5, 20_000
 # Slopes of medians of 3 x 3 cells are measured over at least so many cells to each side, so that they share no cell

@@ -19,6 +19,7 @@ from typing import Any
 
 from zlocus.core.errors import InputError
 from zlocus.core.options import RunConfig
+from zlocus.core.quoting import quoted
 from zlocus.core.resources import peak_memory_mb
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.config import config_as_dict
@@ -191,7 +192,7 @@ def check_not_aligned(run: Mapping[str, Any], path: Path) -> None:
     if "alignment" in run:
         raise InputError(
             f"{path} is of a surface that was moved by `zlocus align`, so that its cameras do not go with it any more. "
-            f"Give the surface as it was before, {run['alignment'].get('surface')}."
+            f"Give the surface as it was before, {quoted(run['alignment'].get('surface'))}."
         )
 
 

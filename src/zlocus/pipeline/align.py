@@ -137,7 +137,8 @@ def alignment_record(request: AlignRequest, points: PointOptions, sample: FitSam
     }  # fmt: skip
     of_points = {name: value for name, value in vars(points).items() if value} if are_points(request.references) else {}
     return {
-        "surface": str(request.surface), "references": list(map(str, request.references)), "created": utc_now(),
+        "surface": str(request.surface), "references": list(map(str, request.references)),
+        "created": utc_now(), "started_in": str(Path.cwd()),
         "versions": versions_record(), "options": asked | {"points": of_points}, **fit.as_dict(),
         "grid": "kept, heights interpolated" if request.keep_grid else "moved with the surface, nothing interpolated",
         "n_available": sample.n_available, "left_out": sample.left_out or {},

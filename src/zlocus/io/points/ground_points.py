@@ -17,6 +17,9 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.io.points.columns import ROLES
 from zlocus.io.points.land_cover import LASER_NAMES, LASER_VEGETATION, OTHER_COVER, VEGETATION
 
+# Heights beyond these stand for a missing one, whatever number a program chose for it.
+MIN_HEIGHT_M, MAX_HEIGHT_M = -1e4, 1e5
+NO_HEIGHT = "no height"
 RETURNS = ("all", "last", "first")
 Bounds = tuple[float, float, float, float]
 

@@ -17,7 +17,15 @@ from pyproj.exceptions import CRSError
 from zlocus.core.errors import InputError
 from zlocus.io.crs import file_crs
 from zlocus.io.open_raster import existing_file
-from zlocus.io.points.ground_points import Bounds, GroundPoints, PointFile, PointOptions
+from zlocus.io.points.ground_points import (
+    MAX_HEIGHT_M,
+    MIN_HEIGHT_M,
+    NO_HEIGHT,
+    Bounds,
+    GroundPoints,
+    PointFile,
+    PointOptions,
+)
 from zlocus.io.points.land_cover import LASER_NOISE, laser_name
 
 WHAT = "cloud of points"
@@ -129,7 +137,9 @@ def _points(
         point_file.cover_names[int(code)] = laser_name(int(code))
     if not np.isfinite(xyz).all():
         raise InputError(f"{path} is damaged: it has points without a place. Copy it again from its source.")
-    return GroundPoints.of(xyz, codes[chosen])
+    has_height = (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M)
+    point_file.leave_out(NO_HEIGHT, int(np.count_nonzero(~has_height)))
+    return GroundPoints.of(xyz[has_height], codes[chosen][has_height])
 
 
 def _chosen(record: laspy.ScaleAwarePointRecord, point_file: PointFile, options: PointOptions) -> NDArray[np.bool_]:

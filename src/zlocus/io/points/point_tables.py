@@ -21,8 +21,15 @@ from zlocus.core.quoting import first_names, quoted
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import file_crs
 from zlocus.io.open_raster import existing_file
-from zlocus.io.points.columns import NEEDED, are_degrees, columns_of
-from zlocus.io.points.ground_points import GroundPoints, PointFile, PointOptions
+from zlocus.io.points.columns import NEEDED, ROLES, are_degrees, columns_of
+from zlocus.io.points.ground_points import (
+    MAX_HEIGHT_M,
+    MIN_HEIGHT_M,
+    NO_HEIGHT,
+    GroundPoints,
+    PointFile,
+    PointOptions,
+)
 from zlocus.io.points.land_cover import cover_name
 from zlocus.io.safe_text import decimal, is_decimal, text_lines
 from zlocus.sensors.earth_frame import WGS84
@@ -30,9 +37,7 @@ from zlocus.sensors.earth_frame import WGS84
 WHAT = "table of points"
 SEPARATORS = (",", ";", "\t")
 VECTOR_FORMATS = ("GPKG", "GeoJSON", "GeoJSONSeq", "ESRI Shapefile", "FlatGeobuf")
-# Heights beyond these stand for a missing one, whatever number a program chose for it.
-MIN_HEIGHT_M, MAX_HEIGHT_M = -1e4, 1e5
-NO_HEIGHT, REPEATED = "no height", "given twice"
+REPEATED = "given twice"
 ROWS_AT_A_TIME = 500_000
 MISSING = ("", "nan", "null", "none", "na", "n/a")
 PARQUET_ADVICE = (
@@ -179,8 +184,6 @@ def _with_geometry(
 
 
 def _may_be_height(name: str) -> bool:
-    from zlocus.io.points.columns import ROLES
-
     return name.strip().lower() in ROLES["z"]
 
 
