@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
@@ -33,9 +34,9 @@ from zlocus.matching.quality import Quality
 
 # Cells of the surface that are held in memory, with their medians: 360 MB.
 MAX_CELLS = 30_000_000
-MAX_POINTS = 400_000
+MAX_POINTS = 200_000
 # Places that are looked up for all points together, where a point is the mean of an area.
-MAX_PLACES = 4_000_000
+MAX_PLACES = 2_000_000
 SEED = 0
 # Beside the largest shift, slopes are measured this far away.
 SLOPE_REACH_CELLS = 10
@@ -124,13 +125,15 @@ class FitSample:
     def some(self, n: int) -> FitSample:
         """About n of the places, chosen at random."""
         share = n / max(len(self), 1)
-        if share >= 1:
-            return self
-        random = np.random.default_rng(SEED)
-        parts = []
-        for part in self.parts:
-            chosen = random.random(len(part.z)) < share
-            parts.append(FitPart(part.surface, part.points.where(chosen), part.z[chosen], part.time_s[chosen]))
+        return self if share >= 1 else self.where(np.random.default_rng(SEED).random(len(self)) < share)
+
+    def where(self, chosen: NDArray[np.bool_]) -> FitSample:
+        """The places that a mask (n,) selects."""
+        ends = np.cumsum([len(part.z) for part in self.parts])[:-1]
+        parts = [
+            replace(part, points=part.points.where(one), z=part.z[one], time_s=part.time_s[one])
+            for part, one in zip(self.parts, np.split(chosen, ends), strict=True)
+        ]
         return replace(self, parts=tuple(parts))
 
 

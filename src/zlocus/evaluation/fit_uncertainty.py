@@ -47,8 +47,13 @@ def covariance_of(
 
 def areas(relative: FloatArray, per_side: int) -> NDArray[np.int64]:
     """Number of the area of each place (n,), from 0 on without gaps; `per_side` along the longer side."""
-    cell = np.clip(np.floor((relative + 1) / 2 * per_side), 0, per_side - 1).astype(np.int64)
+    cell = area_cells(relative, per_side)
     return np.asarray(np.unique(cell[:, 0] * per_side + cell[:, 1], return_inverse=True)[1].ravel(), np.int64)
+
+
+def area_cells(relative: FloatArray, per_side: int) -> NDArray[np.int64]:
+    """Column and row (n, 2) of the area of each place; see `areas`."""
+    return np.clip(np.floor((relative + 1) / 2 * per_side), 0, per_side - 1).astype(np.int64)
 
 
 def passes(time_s: FloatArray) -> NDArray[np.int64]:

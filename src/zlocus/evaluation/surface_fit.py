@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from zlocus.core.errors import InputError
 from zlocus.core.sensor_model import FloatArray
+from zlocus.evaluation.alignment import MAX_SHIFT_M, MIN_SPREAD_RISE
 from zlocus.evaluation.coregistration import MIN_SIGMA_M, TUKEY_SIGMAS
 from zlocus.evaluation.fit_sample import FitSample
-from zlocus.evaluation.fit_uncertainty import covariance_of
+from zlocus.evaluation.fit_uncertainty import area_cells, covariance_of
 from zlocus.evaluation.relief import MAX_SLOPE, MIN_SLOPE_SPREAD
+from zlocus.evaluation.spread import median_deviation
 
 # Number of points that each kind of fit needs at least.
 MIN_FOR_HEIGHT, MIN_FOR_TILT, MIN_FOR_SHIFT = 3, 10, 100
 CONVERGED_M, MAX_STEPS, WEIGHT_ROUNDS = 0.0005, 30, 10
+# After all steps, a last one below this share of a cell is good enough.
+NEAR_CELLS = 0.02
+# A step is at most so many times as long as the one that the equations give.
+MAX_LENGTHENING = 4.0
 # The search tries shifts on a grid of so many places to each side, with some of the points.
 SEARCH_STEPS, SEARCH_POINTS = 5, 20_000
 # Slopes of medians of 3 x 3 cells are measured over at least so many cells to each side, so that they share no cell
@@ -26,10 +32,17 @@ SEARCH_STEPS, SEARCH_POINTS = 5, 20_000
 SLOPE_CELLS = 3.0
 # A shift counts as known where its standard error is below half a cell, or below a third of the shift itself.
 MAX_SIGMA_CELLS, MAX_SIGMA_SHARE = 0.5, 1.0 / 3.0
+# Differences are compared with those of shifts some metres and some cells beside.
+BESIDE_CELLS = 8
+# Two halves of a scene, each a half of so many areas along a side, must give shifts that differ by at most so many
+# standard deviations, or by a cell.
+AREAS_OF_HALVES, MAX_APART_SIGMAS = 6, 3.0
 # Where less than this share of the slopes' scatter is relief that the reference has too, it is noise.
 MIN_RELIEF_SHARE = 0.1
 # Points must spread across a scene by this share of its half length, or a tilt is not known.
 MIN_TILT_SPREAD = 0.03
+# Derivatives are taken over steps that change heights by this share of their spread.
+DIFFERENCE_SCALES = 0.2
 EAST, NORTH, UP, TILT_EAST, TILT_NORTH = range(5)
 
 
@@ -143,6 +156,34 @@ class _State:
     steps: int = 1
 
 
+class _Secant:
+    """Steps to where a shift no longer changes (Broyden 1965, Mathematics of Computation 19, eq. 4.5, "good" method).
+
+    Slopes that are partly noise make the steps of the equations too short, all by the same factor. What a step has
+    changed says how much longer the next one must be.
+    """
+
+    def __init__(self) -> None:
+        self._inverse: FloatArray = -np.eye(2)
+        self._at: FloatArray = np.zeros(2)
+        self._change: FloatArray | None = None
+
+    def step(self, at: FloatArray, change: FloatArray) -> FloatArray:
+        """The next step (2,) m from a shift, by the step that the equations give there."""
+        if self._change is not None:
+            moved, changed = at - self._at, change - self._change
+            back = moved @ self._inverse
+            if abs(back @ changed) > 1e-12:
+                self._inverse = self._inverse + np.outer(moved - self._inverse @ changed, back) / (back @ changed)
+        self._at, self._change = at, change
+        step, limit = -self._inverse @ change, MAX_LENGTHENING * float(np.hypot(*change))
+        length = float(np.hypot(*step))
+        if not np.isfinite(length) or step @ change <= 0:
+            self._inverse = -np.eye(2)
+            return change
+        return np.asarray(step * min(1.0, limit / length) if length else change)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fitter:
     """A sample with its places about the centre, (n, 2), in units of half the length of the scene."""
@@ -169,28 +210,34 @@ class _Fitter:
 
     def horizontal(self, max_shift_m: float) -> SurfaceFit | str:
         """The fit with a horizontal shift; or why that is not known, as a clause."""
-        start = self._searched(max_shift_m)
-        least_m = SLOPE_CELLS * self.sample.cell_m
-        half_step_m, state = max(max_shift_m / (2 * SEARCH_STEPS), least_m), None
-        while True:
-            state = self.solved(start, half_step_m)
-            start = state.values[:2]
-            if half_step_m == least_m:
-                break
-            half_step_m = max(half_step_m / 2, least_m)
-        if np.abs(start).max() > 1.5 * max_shift_m:
+        state = self.coarse_to_fine(max_shift_m)
+        shift = state.values[:2]
+        if not np.hypot(*shift) <= max_shift_m:
             return f"the shift leads further than {max_shift_m:g} m, up to which it is sought (--max-shift)"
         if state.steps > MAX_STEPS:
             return "it does not converge"
-        reason = self._why_flat(start)
+        reason = self._why_flat(shift)
         if reason is not None:
             return reason
         fit = self.result(state, None)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[:2, :2])[-1]))
-        limit_m = max(MAX_SIGMA_CELLS * self.sample.cell_m, MAX_SIGMA_SHARE * float(np.hypot(*start)))
+        limit_m = max(MAX_SIGMA_CELLS * self.sample.cell_m, MAX_SIGMA_SHARE * float(np.hypot(*shift)))
         if not sigma_m <= limit_m:
             return f"it would be known to {sigma_m:.2g} m, and {limit_m:.2g} m are needed"
-        return fit
+        if not self._is_lowest(shift):
+            return "the differences spread hardly less there than some metres beside"
+        return fit if self._agrees(fit, max_shift_m) else "two halves of the scene give different shifts"
+
+    def coarse_to_fine(self, max_shift_m: float) -> _State:
+        """The fit from the searched shift on, with slopes over shorter and shorter distances."""
+        start = self._searched(max_shift_m)
+        least_m = SLOPE_CELLS * self.sample.cell_m
+        half_step_m = max(max_shift_m / (2 * SEARCH_STEPS), least_m)
+        while True:
+            state = self.solved(start, half_step_m)
+            if half_step_m == least_m or not np.isfinite(state.values).all():
+                return state
+            start, half_step_m = state.values[:2], max(half_step_m / 2, least_m)
 
     def _searched(self, max_shift_m: float) -> FloatArray:
         """The shift of a coarse grid at which half of the differences lie closest together."""
@@ -206,19 +253,19 @@ class _Fitter:
 
     def solved(self, shift: FloatArray, half_step_m: float | None) -> _State:
         """The fit from a first shift on. half_step_m : over which slopes are measured; None holds the shift."""
-        values = np.array([*shift, 0.0, 0.0, 0.0])
+        values, secant = np.array([*shift, 0.0, 0.0, 0.0]), _Secant()
         for step in range(1, MAX_STEPS + 1):
             difference, design = self._equations(values[:2], half_step_m)
             found, scale_m = _robust(design, difference, 0 if half_step_m is None else 2)
-            moved = np.zeros(2) if half_step_m is None else found[:2]
+            moved = np.zeros(2) if half_step_m is None else secant.step(values[:2], found[:2])
             free = found[2:] if half_step_m is not None else found
             values = np.array([*(values[:2] + moved), *free, *[0.0] * (3 - len(free))])
-            state = _State(values, scale_m, half_step_m, step)
             if half_step_m is None or np.hypot(*moved) < CONVERGED_M:
-                return state
+                return _State(values, scale_m, half_step_m, step)
             if not np.isfinite(values).all() or np.abs(moved).max() > 1e4:
                 break
-        return _State(values, scale_m, half_step_m, MAX_STEPS + 1)
+        is_near = bool(np.hypot(*moved) < NEAR_CELLS * self.sample.cell_m)
+        return _State(values, scale_m, half_step_m, MAX_STEPS if is_near else MAX_STEPS + 1)
 
     def _equations(self, shift: FloatArray, half_step_m: float | None) -> tuple[FloatArray, FloatArray]:
         """Height differences (n,) at a shift, NaN where unknown, and their change (n, k) by the unknowns."""
@@ -246,7 +293,7 @@ class _Fitter:
         """The fit with its uncertainty."""
         free = [*(() if state.half_step_m is None else (EAST, NORTH)), UP, *((TILT_EAST, TILT_NORTH) * self.has_tilt)]
         score, weight = self._score(state.values, state)
-        steps = np.where(np.arange(5) < UP, self.sample.cell_m / 2, 0.2 * state.scale_m)
+        steps = np.where(np.arange(5) < UP, self._step_m(state), DIFFERENCE_SCALES * state.scale_m)
         jacobian = np.empty((len(free), len(free)))
         for k, unknown in enumerate(free):
             ahead, behind = (state.values + sign * steps * (np.arange(5) == unknown) for sign in (1, -1))
@@ -261,6 +308,48 @@ class _Fitter:
             int(np.count_nonzero(np.isfinite(self.sample.differences(state.values[:2])))), int(np.count_nonzero(used)),
             state.scale_m, state.steps, n_groups, self.has_tilt, undetermined,
         )  # fmt: skip
+
+    def _is_lowest(self, shift: FloatArray) -> bool:
+        """Whether differences spread less at a shift than some metres beside it, in every direction.
+
+        It is moved by whole cells, after which interpolation averages noise as much as before.
+        """
+        cell_m = self.sample.cell_m
+        beside_m = cell_m * max(BESIDE_CELLS, round(MAX_SHIFT_M / cell_m))
+        ways = np.array([(u, v) for u, v in itertools.product((-1, 0, 1), repeat=2) if u or v])
+        return self._spread(shift) * (1 + MIN_SPREAD_RISE) < min(self._spread(shift + way * beside_m) for way in ways)
+
+    def _spread(self, shift: FloatArray) -> float:
+        differences = self.sample.differences(shift)
+        return median_deviation(differences[np.isfinite(differences)])
+
+    def _agrees(self, fit: SurfaceFit, max_shift_m: float) -> bool:
+        """Whether two halves of the scene, a chequerboard of areas, give the same shift, each found on its own.
+
+        Where both surfaces are noise, some shift solves the equations and even looks better than others; in the other
+        half of the scene it is another one.
+        """
+        is_dark, found = area_cells(self.relative, AREAS_OF_HALVES).sum(axis=1) % 2 == 1, list[FloatArray]()
+        for chosen in (is_dark, ~is_dark):
+            if np.count_nonzero(chosen) < MIN_FOR_SHIFT / 4:
+                return False
+            half = replace(self, sample=self.sample.where(chosen), relative=self.relative[chosen])
+            found.append(half.coarse_to_fine(max_shift_m).values[:2])
+        apart_m = float(np.hypot(*(found[0] - found[1])))
+        # The difference of two halves has twice the standard deviation of the whole.
+        sigma_m = 2 * float(np.sqrt(np.trace(fit.covariance[:2, :2])))
+        return apart_m < max(self.sample.cell_m, MAX_APART_SIGMAS * sigma_m)
+
+    def _step_m(self, state: _State) -> float:
+        """Step of the horizontal shift over which the equations are differentiated, m.
+
+        It changes heights by a part of their spread, so that weights change little, and is half a cell at most.
+        """
+        if state.half_step_m is None:
+            return self.sample.cell_m / 2
+        _, design = self._equations(state.values[:2], state.half_step_m)
+        slope = float(np.sqrt(np.mean(design[:, :2] ** 2)))
+        return min(self.sample.cell_m / 2, DIFFERENCE_SCALES * state.scale_m / max(slope, 1e-6))
 
     def _why_flat(self, shift: FloatArray) -> str | None:
         """Why the ground is too flat to tell a horizontal shift, as a clause; None where it is not.

@@ -102,16 +102,17 @@ def vector_table(path: Path, options: PointOptions) -> PointFile:
 
     existing_file(path, WHAT)
     try:
-        layers = pyogrio.list_layers(path)[:, 0]
-        if len(layers) != 1:
-            raise InputError(
-                f"{path} has {len(layers)} layers ({first_names(list(layers), 8)}). Give a file with one layer of "
-                "points."
-            )
-        if (kind := pyogrio.read_info(path)["driver"]) not in VECTOR_FORMATS:
-            raise InputError(f"{path} is no file of points that is read ({kind}). Give GeoPackage, GeoJSON or CSV.")
         with warnings.catch_warnings():
+            # The library warns of what is odd in a file, and fails where that matters.
             warnings.simplefilter("ignore", RuntimeWarning)
+            layers = pyogrio.list_layers(path)[:, 0]
+            if len(layers) != 1:
+                raise InputError(
+                    f"{path} has {len(layers)} layers ({first_names(list(layers), 8)}). Give a file with one layer of "
+                    "points."
+                )
+            if (kind := pyogrio.read_info(path)["driver"]) not in VECTOR_FORMATS:
+                raise InputError(f"{path} is no file of points that is read ({kind}). Give GeoPackage, GeoJSON or CSV.")
             meta, _, wkb, values = pyogrio.raw.read(path)
             geometry = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:
