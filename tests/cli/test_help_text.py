@@ -72,7 +72,7 @@ def test_the_help_is_as_wide_as_the_terminal_up_to_a_limit():
     ("name", "usage"),
     [
         ("dsm", "INPUT..."), ("paper", "FIGURE [INPUT...]"), ("tiles plan", "OUT [INPUT...]"), ("tiles run", "OUT N"),
-        ("evaluate", "DSM REFERENCE"),
+        ("evaluate", "DSM REFERENCE..."),
     ],
 )  # fmt: skip
 def test_arguments_have_one_form(name, usage):

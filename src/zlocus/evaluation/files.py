@@ -39,7 +39,7 @@ def write_evaluation(out: Path, evaluation: Evaluation) -> None:
     write_record(out / FIGURES, evaluation.as_dict())
 
 
-def write_point_evaluation(out: Path, found: PointEvaluation) -> tuple[str, ...]:
+def write_point_evaluation(out: Path, point_evaluation: PointEvaluation) -> tuple[str, ...]:
     """Write the files of an evaluation at points, as `write_evaluation` does; the names of those that were written.
 
     `POINT_ERRORS` lists each point with its error; it is left out for clouds.
@@ -51,15 +51,16 @@ def write_point_evaluation(out: Path, found: PointEvaluation) -> tuple[str, ...]
     """
     _begin(out)
     names: tuple[str, ...] = POINT_EVALUATION_FILES
-    if found.is_cloud:
+    if point_evaluation.is_cloud:
         names = tuple(name for name in names if name != POINT_ERRORS)
     else:
         write_number_table(
-            out / POINT_ERRORS, found.columns(), "x, y in the surface's CRS; heights in its vertical datum, m",
-            {"class": found.cover},
+            out / POINT_ERRORS, point_evaluation.columns(),
+            "x, y in the surface's CRS; heights in its vertical datum, m",
+            {"class": point_evaluation.cover},
         )  # fmt: skip
-    _write_figure(out, errors_figure(found.evaluation, found.errors, places="points"))
-    write_record(out / FIGURES, found.as_dict())
+    _write_figure(out, errors_figure(point_evaluation.evaluation, point_evaluation.errors, places="points"))
+    write_record(out / FIGURES, point_evaluation.as_dict())
     return names
 
 

@@ -28,7 +28,7 @@ from zlocus.evaluation.truth import places
 from zlocus.evaluation.vertical import above, above_geoid, geoid_datum, stated_datum
 from zlocus.io.crs import is_on_earth
 from zlocus.io.open_raster import cached_raster
-from zlocus.io.points.ground_points import GroundPoints
+from zlocus.io.points.ground_points import KnownPoints
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.quality import Quality
 
@@ -174,7 +174,7 @@ def sample_of_points(reference: PointReference, max_shift_m: float, quality: Pat
 
 
 def sample_around(
-    height_file: HeightFile, points: GroundPoints, max_shift_m: float, quality: Path | None = None
+    height_file: HeightFile, points: KnownPoints, max_shift_m: float, quality: Path | None = None
 ) -> FitSample:
     """The surface around points in its CRS, all inside of it; see `sample_of_points`."""
     blocks = height_file.blocks_of(points.xyz[:, :2])
@@ -215,8 +215,8 @@ class RasterHeights:
     height_file: HeightFile
     reference: HeightFile
     datums: tuple[str | None, str | None]
-    reference_datum: VerticalDatum
-    surface_datum: VerticalDatum
+    reference_vertical_datum: VerticalDatum
+    surface_vertical_datum: VerticalDatum
     geoid_added_to: Path | None
 
     @classmethod
@@ -272,7 +272,9 @@ class RasterHeights:
         z, crs = reference.nearest(xy), self.reference.horizontal
         known = np.isfinite(z)
         if crs is not None and known.any():
-            z[known] += self.reference_datum.undulation(xy[known], crs) - self.surface_datum.undulation(xy[known], crs)
+            z[known] += self.reference_vertical_datum.undulation(
+                xy[known], crs
+            ) - self.surface_vertical_datum.undulation(xy[known], crs)
         return z
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.io.points.ground_points import GroundPoints
+from zlocus.io.points.ground_points import KnownPoints
 
 SEED = 0
 
@@ -18,12 +18,12 @@ class PointChoice:
 
     def __init__(self, most: int) -> None:
         self._most, self._random = most, np.random.default_rng(SEED)
-        self._parts: list[GroundPoints] = []
+        self._parts: list[KnownPoints] = []
         self._values: list[FloatArray] = []
         self._priorities: list[FloatArray] = []
         self.n = 0
 
-    def add(self, points: GroundPoints, values: FloatArray | None = None) -> None:
+    def add(self, points: KnownPoints, values: FloatArray | None = None) -> None:
         """Add points. values : (n,) a number of each, kept with it."""
         self.n += len(points)
         self._parts.append(points)
@@ -33,7 +33,7 @@ class PointChoice:
             self._reduce()
 
     @property
-    def points(self) -> GroundPoints:
+    def points(self) -> KnownPoints:
         """The chosen points."""
         self._reduce()
         return self._parts[0]
@@ -45,7 +45,7 @@ class PointChoice:
         return self._values[0]
 
     def _reduce(self) -> None:
-        points, values = GroundPoints.joined(self._parts), np.concatenate(self._values)
+        points, values = KnownPoints.joined(self._parts), np.concatenate(self._values)
         priorities = np.concatenate(self._priorities)
         if len(points) > self._most:
             chosen = np.sort(np.argpartition(priorities, self._most)[: self._most])

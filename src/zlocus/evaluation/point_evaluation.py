@@ -30,7 +30,7 @@ from zlocus.evaluation.point_reference import PointReference
 from zlocus.evaluation.shift import Shift
 from zlocus.evaluation.statistics import error_statistics
 from zlocus.evaluation.surface_fit import MIN_FOR_HEIGHT, fit_surface
-from zlocus.io.points.ground_points import GroundPoints, PointOptions
+from zlocus.io.points.ground_points import KnownPoints, PointOptions
 
 # Of larger clouds so many points are judged, chosen at random.
 MAX_JUDGED = 1_000_000
@@ -56,7 +56,7 @@ class PointEvaluation:
     vva: VerticalAccuracy | None
     has_cover: bool
     horizontal: HorizontalAccuracy | None
-    points: GroundPoints
+    points: KnownPoints
     cover: Sequence[str]
     z: FloatArray
     errors: FloatArray
@@ -136,10 +136,13 @@ def evaluate_at_points(
 
 
 def _judged(
-    reference: PointReference, comparison: Comparison, options: PointOptions, read: tuple[GroundPoints, FloatArray, int]
+    reference: PointReference,
+    comparison: Comparison,
+    options: PointOptions,
+    points_read: tuple[KnownPoints, FloatArray, int],
 ) -> PointEvaluation:
-    """The figures of points. read : points, heights of the surface there, and number of points in all."""
-    points, z, n_points = read
+    """The figures of points. points_read : points, heights of the surface there, and number of points in all."""
+    points, z, n_points = points_read
     point_file, errors = reference.point_file, z - points.xyz[:, 2]
     names = point_file.cover_names
     vegetated = [code for code, name in names.items() if options.is_vegetated(name, point_file.is_cloud)]
@@ -173,7 +176,7 @@ def _judged(
     )  # fmt: skip
 
 
-def _shift(height_file: HeightFile, points: GroundPoints, errors: FloatArray) -> Shift:
+def _shift(height_file: HeightFile, points: KnownPoints, errors: FloatArray) -> Shift:
     """The shift of the surface against points; its height is the median error after the horizontal shift."""
     if not in_metres(height_file.horizontal):
         reason = "the surface is not on a map in metres"

@@ -16,7 +16,7 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.evaluation.height_file import HeightFile
 from zlocus.evaluation.vertical import above, above_geoid, geoid_datum, stated_datum
 from zlocus.io.crs import crs_label, is_on_earth
-from zlocus.io.points.ground_points import Bounds, GroundPoints, PointFile, PointOptions
+from zlocus.io.points.ground_points import Bounds, KnownPoints, PointFile, PointOptions
 from zlocus.io.points.open_points import open_points
 from zlocus.io.vertical import ELLIPSOID, ELLIPSOIDAL, VerticalDatum, named_vertical_datum
 from zlocus.sensors.earth_frame import between
@@ -29,8 +29,8 @@ class PointReference:
     """A file of points, as the reference of a surface.
 
     crs : of the points; None: coordinates are used as they are. datums : vertical datums of surface and points as
-    their files state them, None where one does not. points_datum : to whose heights z of the points refers before it
-    is converted; surface_datum : what is added to heights of the surface: one of both may be a geoid.
+    their files state them, None where one does not. points_vertical_datum : what z of the points is above before it
+    is converted; surface_vertical_datum : what is added to heights of the surface: one of both may be a geoid.
     assumed : what had to be assumed, as sentences.
     """
 
@@ -38,8 +38,8 @@ class PointReference:
     point_file: PointFile
     crs: CRS | None
     datums: tuple[str | None, str | None]
-    points_datum: VerticalDatum = ELLIPSOIDAL
-    surface_datum: VerticalDatum = ELLIPSOIDAL
+    points_vertical_datum: VerticalDatum = ELLIPSOIDAL
+    surface_vertical_datum: VerticalDatum = ELLIPSOIDAL
     assumed: tuple[str, ...] = ()
     geoid_added_to: Path | None = None
     default_sigma_m: float = math.nan
@@ -83,33 +83,34 @@ class PointReference:
         height_file, path = self.height_file, self.point_file.path
         mine = stated_datum(height_file.spatial, height_file.path, height_file.description)
         theirs = None if self.point_file.crs is None else stated_datum(self.point_file.crs, path)
-        points_datum = surface_datum = ELLIPSOIDAL
+        points_vertical_datum = surface_vertical_datum = ELLIPSOIDAL
         if options.vertical is not None:
-            points_datum, theirs = named_vertical_datum(options.vertical, "--points-vertical"), ELLIPSOID
-            if points_datum.crs is not None and mine == points_datum.crs.name:
-                points_datum, theirs = ELLIPSOIDAL, mine  # heights are of one kind already
-        if points_datum.geoid is not None and mine is None:
+            points_vertical_datum, theirs = named_vertical_datum(options.vertical, "--points-vertical"), ELLIPSOID
+            if points_vertical_datum.crs is not None and mine == points_vertical_datum.crs.name:
+                points_vertical_datum, theirs = ELLIPSOIDAL, mine  # heights are of one kind already
+        if points_vertical_datum.geoid is not None and mine is None:
             mine = ELLIPSOID
             assumed.append(f"{height_file.path} does not state its vertical datum: taken to be above the ellipsoid")
         converted = above_geoid((height_file.path, path), (mine, theirs), geoid)
         if geoid is not None and converted is not None:
-            points_datum = geoid_datum(geoid) if converted == path else points_datum
-            surface_datum = geoid_datum(geoid) if converted == height_file.path else surface_datum
+            points_vertical_datum = geoid_datum(geoid) if converted == path else points_vertical_datum
+            surface_vertical_datum = geoid_datum(geoid) if converted == height_file.path else surface_vertical_datum
         elif (mine is None) != (theirs is None):
             silent = path if theirs is None else height_file.path
             assumed.append(
                 f"{silent} does not state its vertical datum: taken to be {above(mine or theirs)}, as of the other"
             )
-        if (points_datum.geoid or surface_datum.geoid) and self.crs is None:
+        if (points_vertical_datum.geoid or surface_vertical_datum.geoid) and self.crs is None:
             raise InputError(f"{path} has no CRS, so no geoid can be added to its heights. Give it with --points-crs.")
         sigma_m = math.nan if options.sigma_m is None else options.sigma_m
-        raised = converted or (path if points_datum.geoid is not None else None)
+        raised = converted or (path if points_vertical_datum.geoid is not None else None)
         return replace(
-            self, datums=(mine, theirs), points_datum=points_datum, surface_datum=surface_datum,
+            self, datums=(mine, theirs), points_vertical_datum=points_vertical_datum,
+            surface_vertical_datum=surface_vertical_datum,
             assumed=tuple(assumed), geoid_added_to=raised, default_sigma_m=sigma_m,
         )  # fmt: skip
 
-    def chunks(self) -> Iterator[GroundPoints]:
+    def chunks(self) -> Iterator[KnownPoints]:
         """The points inside of the raster, in the surface's CRS, with heights in its vertical datum.
 
         Raises
@@ -154,11 +155,11 @@ class PointReference:
         found = np.column_stack(transformer.transform(xy[:, 0], xy[:, 1]))
         return np.where(np.isfinite(found), found, np.nan)  # infinite where the CRS cannot express a place
 
-    def _converted(self, points: GroundPoints, xy: FloatArray) -> GroundPoints:
+    def _converted(self, points: KnownPoints, xy: FloatArray) -> KnownPoints:
         z = points.xyz[:, 2]
         if self.crs is not None:
-            z = z + self.points_datum.undulation(points.xyz[:, :2], self.crs)
-            z = z - self.surface_datum.undulation(points.xyz[:, :2], self.crs)
+            z = z + self.points_vertical_datum.undulation(points.xyz[:, :2], self.crs)
+            z = z - self.surface_vertical_datum.undulation(points.xyz[:, :2], self.crs)
         measured = points.measured_xy
         if np.isfinite(measured).any():
             measured = self.in_surface(measured)

@@ -11,40 +11,41 @@ from zlocus.evaluation.point_evaluation import PointEvaluation
 from zlocus.evaluation.table import TEXT_ERROR_COLUMNS, accuracy_table, aligned_lines, table_lines
 
 
-def point_table(found: PointEvaluation) -> str:
+def point_table(point_evaluation: PointEvaluation) -> str:
     """Text with a row for all points and for each kind of ground, then the accuracy by the standard, and notes."""
-    evaluation = found.evaluation
+    evaluation = point_evaluation.evaluation
     table = accuracy_table(evaluation, None, TEXT_ERROR_COLUMNS)
     lines = table_lines(table._replace(first_headings=("", "points", "complete")))
-    return "\n".join([*lines, *_notes(found), "", *asprs_lines(found)])
+    return "\n".join([*lines, *_notes(point_evaluation), "", *asprs_lines(point_evaluation)])
 
 
-def _notes(found: PointEvaluation) -> Iterator[str]:
-    evaluation = found.evaluation
+def _notes(point_evaluation: PointEvaluation) -> Iterator[str]:
+    evaluation = point_evaluation.evaluation
     yield "share of all points in error by less than the limit; errors are surface less point, m; LE90: 90th percentile"
     yield "absolute: the surface as it lies"
     yield from aligned_lines(evaluation)
-    if len(found.points) < found.n_points:
-        yield f"{found.n_points} points lie in the surface; {len(found.points)} of them, chosen at random, are judged"
-    for reason, n in found.left_out.items():
+    if len(point_evaluation.points) < point_evaluation.n_points:
+        n_judged = len(point_evaluation.points)
+        yield f"{point_evaluation.n_points} points lie in the surface; {n_judged} of them, chosen at random, are judged"
+    for reason, n in point_evaluation.left_out.items():
         yield f"{counted(n, 'point')} left out: {reason}"
-    yield from found.assumed
+    yield from point_evaluation.assumed
     if evaluation.geoid_added_to is not None:
         yield f"the geoid's heights were added to those of {evaluation.geoid_added_to}"
 
 
-def asprs_lines(found: PointEvaluation) -> Iterator[str]:
+def asprs_lines(point_evaluation: PointEvaluation) -> Iterator[str]:
     """Vertical and horizontal accuracy by the standard, and what keeps them from being a statement by it."""
-    kind = "aligned" if found.evaluation.is_aligned else "absolute"
+    kind = "aligned" if point_evaluation.evaluation.is_aligned else "absolute"
     yield f"ASPRS positional accuracy, edition 2 (2023), {kind} errors, m"
     yield "                    points   RMSE_V1   RMSE_V2    RMSE_V      LE90"
-    yield _vertical_line("non-vegetated (NVA)", found.nva)
-    if found.vva is not None:
-        yield _vertical_line("vegetated (VVA)", found.vva)
+    yield _vertical_line("non-vegetated (NVA)", point_evaluation.nva)
+    if point_evaluation.vva is not None:
+        yield _vertical_line("vegetated (VVA)", point_evaluation.vva)
     yield "RMSE_V1: of the errors; RMSE_V2: of the points themselves; RMSE_V: of both; LE90: 1.6449 RMSE_V"
-    if not found.has_cover:
+    if not point_evaluation.has_cover:
         yield "no kind of ground is known: all points count as non-vegetated"
-    named = {"NVA": found.nva} | ({} if found.vva is None else {"VVA": found.vva})
+    named = {"NVA": point_evaluation.nva} | ({} if point_evaluation.vva is None else {"VVA": point_evaluation.vva})
     for name, accuracy in named.items():
         if not accuracy.is_enough:
             yield (
@@ -56,11 +57,11 @@ def asprs_lines(found: PointEvaluation) -> Iterator[str]:
             "the accuracy of the points is not known and not included in RMSE_V; give it in a column sigma, or with "
             "--points-sigma"
         )
-    if found.is_cloud:
+    if point_evaluation.is_cloud:
         yield "laser points are no surveyed check points: the figures hold the errors of the cloud as well"
-    if found.evaluation.is_aligned:
+    if point_evaluation.evaluation.is_aligned:
         yield "the shift was found at these points and removed, so that they no longer check the surface independently"
-    yield from _horizontal_lines(found)
+    yield from _horizontal_lines(point_evaluation)
 
 
 def _vertical_line(name: str, accuracy: VerticalAccuracy) -> str:
@@ -68,8 +69,8 @@ def _vertical_line(name: str, accuracy: VerticalAccuracy) -> str:
     return f"{name:<19} {accuracy.n_compared:>6}" + "".join(f" {_metres(value):>9}" for value in values)
 
 
-def _horizontal_lines(found: PointEvaluation) -> Iterator[str]:
-    horizontal = found.horizontal
+def _horizontal_lines(point_evaluation: PointEvaluation) -> Iterator[str]:
+    horizontal = point_evaluation.horizontal
     if horizontal is None:
         yield (
             "RMSE_H and CE90 are not known: heights do not show where a point lies in the surface. Measure the points "
@@ -88,8 +89,8 @@ def _horizontal_lines(found: PointEvaluation) -> Iterator[str]:
             f"horizontal: {counted(horizontal.n, 'point')}, fewer than the {MIN_POINTS} that the standard asks for: "
             "this is an indication, and no statement of accuracy by the standard"
         )
-    if found.rmse_3d is not None:
-        yield f"RMSE_3D {_metres(found.rmse_3d)}: of the errors in space"
+    if point_evaluation.rmse_3d is not None:
+        yield f"RMSE_3D {_metres(point_evaluation.rmse_3d)}: of the errors in space"
 
 
 def _metres(value: float) -> str:

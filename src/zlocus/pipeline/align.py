@@ -79,7 +79,7 @@ class AlignedSurface:
         return "\n".join([*lines, *self.notes, f"{self.out}: {', '.join(self.files)} written."])
 
 
-def run_align(request: AlignRequest, points: PointOptions, progress: Progress) -> AlignedSurface:
+def run_align(request: AlignRequest, point_options: PointOptions, progress: Progress) -> AlignedSurface:
     """Move a surface onto a reference, and write it with all rasters that belong to it.
 
     Raises
@@ -97,10 +97,10 @@ def run_align(request: AlignRequest, points: PointOptions, progress: Progress) -
     check_on_map(height_file)
     inputs = inputs_record(request.inputs)
     with stopwatch.stage("sample"), progress.stage("Reading both"):
-        sample = _sample(request, points, height_file)
+        sample = _sample(request, point_options, height_file)
     with stopwatch.stage("fit"), progress.stage("Fitting"):
         fit = fit_surface(sample, request.max_shift_m, request.tilt, request.height_only)
-    alignment, notes = alignment_record(request, points, sample, fit), _notes(request, sample, fit)
+    alignment, notes = alignment_record(request, point_options, sample, fit), _notes(request, sample, fit)
     alignment["inputs"] = inputs
     sources = {HEIGHTS: request.dsm}
     if is_run:
@@ -117,16 +117,18 @@ def run_align(request: AlignRequest, points: PointOptions, progress: Progress) -
     return AlignedSurface(request.out, fit, alignment, (*files, RECORD), notes)
 
 
-def _sample(request: AlignRequest, points: PointOptions, height_file: HeightFile) -> FitSample:
+def _sample(request: AlignRequest, point_options: PointOptions, height_file: HeightFile) -> FitSample:
     quality = request.surface / FLAGS if request.surface.is_dir() else None
     if are_points(request.references):
-        reference = PointReference.open(height_file, request.references, points, request.geoid)
+        reference = PointReference.open(height_file, request.references, point_options, request.geoid)
         return sample_of_points(reference, request.max_shift_m, quality)
     heights = RasterHeights.open(height_file, request.references[0], request.geoid)
     return sample_of_raster(heights, request.max_shift_m, quality)
 
 
-def alignment_record(request: AlignRequest, points: PointOptions, sample: FitSample, fit: SurfaceFit) -> dict[str, Any]:
+def alignment_record(
+    request: AlignRequest, point_options: PointOptions, sample: FitSample, fit: SurfaceFit
+) -> dict[str, Any]:
     """The entry `alignment` of run.json: what was moved onto what, by how much, and how well that is known."""
     east, north, _ = fit.shift_m
     before, moved = sample.differences((0.0, 0.0)), sample.differences((east, north))
@@ -135,7 +137,9 @@ def alignment_record(request: AlignRequest, points: PointOptions, sample: FitSam
         "tilt": request.tilt, "height_only": request.height_only, "max_shift_m": request.max_shift_m,
         "keep_grid": request.keep_grid, "geoid": None if request.geoid is None else str(request.geoid),
     }  # fmt: skip
-    of_points = {name: value for name, value in vars(points).items() if value} if are_points(request.references) else {}
+    of_points = (
+        {name: value for name, value in vars(point_options).items() if value} if are_points(request.references) else {}
+    )
     return {
         "surface": str(request.surface), "references": list(map(str, request.references)),
         "created": utc_now(), "started_in": str(Path.cwd()),

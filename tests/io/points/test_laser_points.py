@@ -11,7 +11,7 @@ import pytest
 from point_files import cloud, copc
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.io.points import laser_points
-from zlocus.io.points.ground_points import GroundPoints, PointOptions
+from zlocus.io.points.ground_points import KnownPoints, PointOptions
 from zlocus.io.points.open_points import open_points
 
 # Coordinates are stored in steps of a millimetre.
@@ -28,7 +28,7 @@ def xyz():
 def read(paths, options=None, bounds=None):
     point_file = open_points(paths, options or PointOptions())
     parts = list(point_file.chunks(bounds))
-    return point_file, GroundPoints.joined(parts) if parts else None
+    return point_file, KnownPoints.joined(parts) if parts else None
 
 
 @pytest.mark.parametrize("name", ["p.las", "p.laz", "p.LAZ"])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from point_files import csv, gpkg
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.io.points.ground_points import GroundPoints, PointOptions
+from zlocus.io.points.ground_points import KnownPoints, PointOptions
 from zlocus.io.points.open_points import open_points
 
 XYZ = np.array([[461000.25, 5247000.5, 431.125], [461100.0, 5247010.0, 440.0], [461050.5, 5247100.0, 12.5]])
@@ -23,7 +23,7 @@ PLAIN = PointOptions()
 
 def read(path, options=PLAIN):
     point_file = open_points([path], options)
-    return point_file, GroundPoints.joined(list(point_file.chunks(None)))
+    return point_file, KnownPoints.joined(list(point_file.chunks(None)))
 
 
 def columns(xyz=XYZ, names=("x", "y", "z"), **more):

@@ -25,7 +25,7 @@ Bounds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class GroundPoints:
+class KnownPoints:
     """Points of a file, or some of them after others.
 
     xyz : (n, 3) float64, finite; z in m, x and y in the units of the file's CRS, longitude first. sigma_m : (n,)
@@ -45,20 +45,20 @@ class GroundPoints:
         return len(self.xyz)
 
     @classmethod
-    def of(cls, xyz: FloatArray, cover: NDArray[np.int64] | None = None) -> GroundPoints:
+    def of(cls, xyz: FloatArray, cover: NDArray[np.int64] | None = None) -> KnownPoints:
         """Points of which only the places, and perhaps the kind of ground, are known."""
         n, unknown = len(xyz), np.full(len(xyz), np.nan)
         return cls(
             xyz, unknown, unknown, unknown, np.full((n, 2), np.nan), np.zeros(n, int) if cover is None else cover
         )
 
-    def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> GroundPoints:
+    def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> KnownPoints:
         """The points that a mask or their numbers select."""
         arrays = (self.xyz, self.sigma_m, self.sigma_xy_m, self.time_s, self.measured_xy, self.cover)
-        return GroundPoints(*(array[chosen] for array in arrays))  # type: ignore[arg-type]
+        return KnownPoints(*(array[chosen] for array in arrays))  # type: ignore[arg-type]
 
     @classmethod
-    def joined(cls, parts: list[GroundPoints]) -> GroundPoints:
+    def joined(cls, parts: list[KnownPoints]) -> KnownPoints:
         """The points of several parts after each other."""
         names = ("xyz", "sigma_m", "sigma_xy_m", "time_s", "measured_xy", "cover")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
@@ -71,13 +71,13 @@ class PointFile:
     path : of the first file, for messages. chunks : yields the points, some after others, so that large clouds need
     little memory; it may leave out clouds that lie outside of bounds (xmin, ymin, xmax, ymax) in the CRS of the points.
     crs : CRS of the points, None where the file has none and none was given; cover_names : kind of ground of each
-    number in `GroundPoints.cover`, filled as chunks are read; empty where the file knows none. is_cloud : laser points.
+    number in `KnownPoints.cover`, filled as chunks are read; empty where the file knows none. is_cloud : laser points.
     left_out : number of points that were left out, by the reason, filled as chunks are read.
     """
 
     path: Path
     crs: CRS | None
-    chunks: Callable[[Bounds | None], Iterator[GroundPoints]]
+    chunks: Callable[[Bounds | None], Iterator[KnownPoints]]
     cover_names: dict[int, str] = field(default_factory=dict)
     is_cloud: bool = False
     left_out: dict[str, int] = field(default_factory=dict)

@@ -22,7 +22,7 @@ from zlocus.io.points.ground_points import (
     MIN_HEIGHT_M,
     NO_HEIGHT,
     Bounds,
-    GroundPoints,
+    KnownPoints,
     PointFile,
     PointOptions,
 )
@@ -100,7 +100,7 @@ def _declared_crs(path: Path, header: laspy.LasHeader) -> CRS | None:
 
 def _chunks(
     point_file: PointFile, clouds: Sequence[_Cloud], options: PointOptions, bounds: Bounds | None
-) -> Iterator[GroundPoints]:
+) -> Iterator[KnownPoints]:
     """The points of clouds, as far as the clouds lie in the bounds by their headers."""
     point_file.left_out.clear()
     for cloud in clouds:
@@ -129,7 +129,7 @@ def _overlap(one: Bounds, other: Bounds) -> bool:
 
 def _points(
     record: laspy.ScaleAwarePointRecord, point_file: PointFile, path: Path, options: PointOptions
-) -> GroundPoints:
+) -> KnownPoints:
     """The points of a record that are used."""
     chosen, codes = _chosen(record, point_file, options), np.asarray(record.classification, np.int64)
     xyz = np.column_stack([np.asarray(axis, np.float64)[chosen] for axis in (record.x, record.y, record.z)])
@@ -139,7 +139,7 @@ def _points(
         raise InputError(f"{path} is damaged: it has points without a place. Copy it again from its source.")
     has_height = (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M)
     point_file.leave_out(NO_HEIGHT, int(np.count_nonzero(~has_height)))
-    return GroundPoints.of(xyz[has_height], codes[chosen][has_height])
+    return KnownPoints.of(xyz[has_height], codes[chosen][has_height])
 
 
 def _chosen(record: laspy.ScaleAwarePointRecord, point_file: PointFile, options: PointOptions) -> NDArray[np.bool_]:

@@ -26,7 +26,7 @@ from zlocus.io.points.ground_points import (
     MAX_HEIGHT_M,
     MIN_HEIGHT_M,
     NO_HEIGHT,
-    GroundPoints,
+    KnownPoints,
     PointFile,
     PointOptions,
 )
@@ -221,7 +221,7 @@ def _point_file(
     times = _times(path, taken["time"], place) if "time" in taken else unknown
     measured = np.column_stack([values.get(f"measured_{axis}", unknown) for axis in "xy"])
     sigma = values.get("sigma", unknown)
-    points = GroundPoints(
+    points = KnownPoints(
         xyz, np.where(sigma > 0, sigma, np.nan), values.get("sigma_xy", unknown), times, measured, cover.ravel()
     )
     has_height = (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M)
@@ -238,7 +238,7 @@ def _point_file(
     return point_file
 
 
-def _parts(points: GroundPoints) -> Iterator[GroundPoints]:
+def _parts(points: KnownPoints) -> Iterator[KnownPoints]:
     for first in range(0, len(points), ROWS_AT_A_TIME):
         yield points.where(np.arange(first, min(first + ROWS_AT_A_TIME, len(points))))
 
