@@ -16,6 +16,8 @@ from typer.testing import CliRunner
 
 from evaluation_rasters import NORTH, WEST, moved, rolling, write
 from places import ROOT
+from point_files import cloud
+from point_scenes import table
 from zlocus.cli import evaluate as command
 from zlocus.cli.app import app
 from zlocus.evaluation import files
@@ -254,6 +256,9 @@ def test_the_commands_of_the_page_run(tmp_path, pair, monkeypatch):
     moved(tmp_path / "moved.tif", N, (1, -1, 2), rolling)
     at = from_origin(8.9, 47.1, 0.05, 0.05)
     write(tmp_path / "geoid.tif", np.full((6, 6), 47.0, np.float32), at, "EPSG:4326")
+    points = table(tmp_path, 200, name="check_points.csv")
+    xyz = np.loadtxt(points, delimiter=",", skiprows=1)
+    cloud(tmp_path / "laser.laz", xyz)
     lines = [line.strip() for line in PAGE.read_text(encoding="utf-8").splitlines()]
     commands = [shlex.split(line, comments=True) for line in lines if line.startswith("zlocus evaluate ")]
     assert len(commands) >= 4

@@ -14,6 +14,7 @@ import numpy as np
 import rasterio
 import shapely
 import typer.main
+from pyproj import Transformer
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +24,7 @@ from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
 from grid_input_files import write_water
 from places import ROOT
+from point_files import cloud, csv
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
 from zlocus.cli.app import app
 from zlocus.io.open_raster import open_raster
@@ -223,6 +225,20 @@ def lay_out_surfaces(folder: Path) -> None:
     write_geoid(folder / "geoid.tif", np.full((8, 8), 48.0, np.float32), from_origin(7.5, 48.5, 0.25, 0.25))
 
 
+def lay_out_points(folder: Path) -> None:
+    """The same, and points of the ground: check points, laser points and heights of a satellite."""
+    lay_out_surfaces(folder)
+    with rasterio.open(folder / "reference.tif") as file:
+        z, transform = file.read(1), file.transform
+    row, col = np.random.default_rng(0).integers(4, 396, (2, 400))
+    x, y = transform * (col + 0.5, row + 0.5)
+    xyz = np.column_stack([x, y, z[row, col]])
+    cloud(folder / "laser.laz", xyz, np.resize([2, 6], len(xyz)))
+    csv(folder / "check_points.csv", {"x": x, "y": y, "z": xyz[:, 2], "sigma": [0.02] * len(x)})
+    lon, lat = Transformer.from_crs("EPSG:32632", 4326, always_xy=True).transform(x, y)
+    csv(folder / "atl08.csv", {"longitude": lon, "latitude": lat, "h_te_best_fit": xyz[:, 2], "time": 86400.0 * row})
+
+
 def lay_out_datums(folder: Path) -> None:
     """Three images, a geoid as a file and as PROJ has two, a terrain model and control points above it."""
     lay_out_images(folder)
@@ -285,13 +301,14 @@ def lay_out_surface(folder: Path) -> None:
 # What a page's commands find in the folder in which they are run.
 LAID_OUT = {
     "README.md": lay_out_readme,
+    "docs/how-to/align.md": lay_out_points,
     "docs/how-to/array_jobs.md": lay_out_images,
     "docs/how-to/cloud.md": lay_out_images_and_area,
     "docs/how-to/compare.md": lay_out_images,
     "docs/how-to/curves.md": lay_out_images,
     "docs/how-to/deliveries.md": lay_out_deliveries,
     "docs/how-to/doctor.md": lay_out_images,
-    "docs/how-to/evaluate.md": lay_out_surfaces,
+    "docs/how-to/evaluate.md": lay_out_points,
     "docs/how-to/import.md": lay_out_cameras,
     "docs/how-to/inspect.md": lay_out_images,
     "docs/how-to/large.md": lay_out_images,
