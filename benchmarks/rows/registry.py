@@ -48,6 +48,7 @@ ROWS: dict[str, Row] = {
     "troubles": Row("rows.troubles:troubles", WITH_RENDERER, is_slow=True),
     "water": Row("rows.water:water", WITH_RENDERER, is_slow=True),
     "clouds": Row("rows.clouds:clouds", WITH_RENDERER, is_slow=True),
+    "align": Row("rows.alignment:align", WITH_RENDERER),
     "precision": Row("rows.standard_deviations:precision", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     "flags": Row("rows.flags:flags", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     # How hard the recipe is for other programs: from benchmarks/peers/results.json.

@@ -41,6 +41,8 @@ AREAS_OF_HALVES, MAX_APART_SIGMAS = 6, 3.0
 MIN_RELIEF_SHARE = 0.1
 # Points must spread across a scene by this share of its half length, or a tilt is not known.
 MIN_TILT_SPREAD = 0.03
+# Interpolation between cells moves shifts by up to this share of a cell, however many places are compared.
+INTERPOLATION_CELLS = 0.01
 # Derivatives are taken over steps that change heights by this share of their spread.
 DIFFERENCE_SCALES = 0.2
 EAST, NORTH, UP, TILT_EAST, TILT_NORTH = range(5)
@@ -303,6 +305,8 @@ class _Fitter:
         some, n_groups = covariance_of(score[used], jacobian, self.relative[used], self.sample.time_s[used])
         covariance = np.zeros((5, 5))
         covariance[np.ix_(free, free)] = some
+        if state.half_step_m is not None:
+            covariance[[EAST, NORTH], [EAST, NORTH]] += (INTERPOLATION_CELLS * self.sample.cell_m) ** 2
         return SurfaceFit(
             state.values, covariance, (float(self.centre[0]), float(self.centre[1])), self.half_length_m,
             int(np.count_nonzero(np.isfinite(self.sample.differences(state.values[:2])))), int(np.count_nonzero(used)),
