@@ -73,6 +73,7 @@ RUN_BY = {
     "roofline_counts.py": "test_speed.py::test_bounds_follow_from_counts",
     "result_files.py": "test_result_files.py::test_a_measured_row_is_read_back_as_it_was_written",
     "rows/__init__.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/alignment.py": "test_alignment_row.py::test_planted_offsets_are_judged",
     "rows/drone_block.py": "test_drone_block_row.py::test_the_row_renders_matches_and_judges",
     "rows/demo.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/fresh.py": "test_seeds.py::test_the_figures_of_a_seed_are_those_of_its_surface",

@@ -44,12 +44,16 @@ SLOPE_REACH_CELLS = 10
 
 @dataclass(frozen=True, eq=False)
 class FitPart:
-    """A window of the surface, and the points in it. z : (n,) true heights, m; time_s : (n,) s, NaN where unknown."""
+    """A window of the surface, and the points in it. z : (n,) true heights, m; time_s : (n,) s, NaN where unknown.
+
+    n_available : number of points there, of which these may be a part.
+    """
 
     surface: HeightRaster
     points: Points
     z: FloatArray
     time_s: FloatArray
+    n_available: int = 0
 
     @cached_property
     def smooth(self) -> HeightRaster:
@@ -309,7 +313,7 @@ def sample_of_raster(heights: RasterHeights, max_shift_m: float, quality: Path |
             f"{height_file.path} and {reference.path} have no height in common. Check the CRS of both, and that they "
             "show the same ground."
         )
-    n = sum(len(part.z) for part in parts) * int(np.count_nonzero(near)) // len(chosen)
+    n = sum(part.n_available for part in parts) * int(np.count_nonzero(near)) // len(chosen)
     return FitSample(parts, height_file.cell, n, heights.datums, heights.assumed, heights.geoid_added_to, {})
 
 
@@ -345,7 +349,8 @@ def _part_of_raster(
     frame = heights.height_file.horizontal
     like = points_on(surface, window, frame, xy[:1])
     most = n if like.areas is None else max(16, min(n, MAX_PLACES // len(like.areas.places) * n // MAX_POINTS))
-    if len(xy) > most:
+    n_available = len(xy)
+    if n_available > most:
         xy = xy[np.sort(np.random.default_rng(SEED + place[0] * 7919 + place[1]).permutation(len(xy))[:most])]
     z = heights.z_of(window, xy)
-    return FitPart(surface, points_on(surface, window, frame, xy), z, np.full(len(z), np.nan))
+    return FitPart(surface, points_on(surface, window, frame, xy), z, np.full(len(z), np.nan), n_available)

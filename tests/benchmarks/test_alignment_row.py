@@ -1,0 +1,27 @@
+"""The acceptance row `align` on one small scene."""
+
+from __future__ import annotations
+
+import pytest
+
+from rows import alignment
+from workplace import Workplace
+
+
+def test_planted_offsets_are_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr(alignment, "fresh_seeds", lambda n: [7])
+    monkeypatch.setattr(alignment, "N_CELLS", 240)
+    monkeypatch.setattr(alignment, "N_POINTS", 4000)
+    figures = {figure.what: figure for figure in alignment.align(Workplace(None, tmp_path))}
+    # A smaller scene than that of the row: shifts are known to some centimetres.
+    assert figures["points: shift, largest"].value < 0.05
+    assert figures["points with tilt: tilt, largest"].value < 0.05
+    assert figures["flat ground: horizontal shifts that were taken"].value == 0
+    assert all(figure.fails_when for figure in figures.values() if figure.bar)
+    planted = alignment._of_scene
+    monkeypatch.setattr(alignment, "aligned", lambda *_: {
+        "offset_m": {"east": 9.0, "north": 9.0, "up": 9.0}, "sigma_m": {"east": 1.0, "north": 1.0, "up": 1.0}, "tilt": None,
+    })  # fmt: skip
+    assert planted(tmp_path / "wrong", 7)["points: shift"] == pytest.approx(
+        9.0 * 2**0.5, abs=2**0.5 * alignment.SHIFT_M
+    )
