@@ -18,10 +18,8 @@ def test_planted_offsets_are_judged(tmp_path, monkeypatch):
     assert figures["points with tilt: tilt, largest"].value < 0.05
     assert figures["flat ground: horizontal shifts that were taken"].value == 0
     assert all(figure.fails_when for figure in figures.values() if figure.bar)
-    planted = alignment._of_scene
-    monkeypatch.setattr(alignment, "aligned", lambda *_: {
-        "offset_m": {"east": 9.0, "north": 9.0, "up": 9.0}, "sigma_m": {"east": 1.0, "north": 1.0, "up": 1.0}, "tilt": None,
-    })  # fmt: skip
-    assert planted(tmp_path / "wrong", 7)["points: shift"] == pytest.approx(
-        9.0 * 2**0.5, abs=2**0.5 * alignment.SHIFT_M
-    )
+    wrong = dict.fromkeys(("east", "north", "up"), 9.0)
+    record = {"offset_m": wrong, "sigma_m": dict.fromkeys(wrong, 1.0), "tilt": None}
+    monkeypatch.setattr(alignment, "aligned", lambda *_: record)
+    off = alignment._of_scene(tmp_path / "wrong", 7)["points: shift"]
+    assert off == pytest.approx(9.0 * 2**0.5, abs=2**0.5 * alignment.SHIFT_M)
