@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import typer
 
 from zlocus import __version__
-from zlocus.cli.answer import Answer
 from zlocus.cli.align import AlignOptions, align
+from zlocus.cli.answer import Answer
 from zlocus.cli.cloud import CloudOptions, cloud
 from zlocus.cli.commands import Command, command_of
 from zlocus.cli.compare import CompareOptions, compare
