@@ -16,6 +16,7 @@ import typer
 from zlocus import __version__
 from zlocus.cli.align import AlignOptions, align
 from zlocus.cli.answer import Answer
+from zlocus.cli.change import ChangeOptions, change
 from zlocus.cli.cloud import CloudOptions, cloud
 from zlocus.cli.commands import Command, command_of
 from zlocus.cli.compare import CompareOptions, compare
@@ -31,6 +32,7 @@ from zlocus.cli.exit_status import show_our_warnings
 from zlocus.cli.help_text import EXAMPLES, MAX_WIDTH, GroupedHelp, short_help
 from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
+from zlocus.cli.mosaic import MosaicOptions, mosaic
 from zlocus.cli.orient import OrientOptions, TiesOptions, orient, ties
 from zlocus.cli.paper import PaperOptions, paper
 from zlocus.cli.products import ProductsOptions, products
@@ -58,6 +60,8 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("evaluate", EvaluateOptions, evaluate),
     ("align", AlignOptions, align),
     ("compare", CompareOptions, compare),
+    ("mosaic", MosaicOptions, mosaic),
+    ("change", ChangeOptions, change),
     ("report", ReportOptions, report),
     ("inspect", InspectOptions, inspect),
     ("config", ConfigOptions, config),

@@ -51,6 +51,14 @@ EXAMPLES = {
         zlocus align surface atl08.csv -o aligned --tilt
         """,
     "compare": "zlocus compare surface other -o comparison",
+    "mosaic": """
+        zlocus mosaic north south -o joined
+        zlocus mosaic strip_1 strip_2 lidar.tif=0.1 -o joined --feather 40
+        """,
+    "change": """
+        zlocus change spring autumn -o changed
+        zlocus change spring autumn -o changed --area pits.gpkg --name pit
+        """,
     "report": "zlocus report surface --reference reference.tif",
     "inspect": "zlocus inspect surface --open",
     "config": "zlocus config -o options.toml",
