@@ -243,7 +243,6 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "PlacedSurface": ("placed",),
     "PolygonFeatures": ("features",),
     "StableWindow": ("window",),
-    "SurfaceCells": ("run", "cells"),
     "SurfaceInput": ("surface", "source", "first", "other", "one"),
     "VisibleHeights": ("visible", "visible_heights", "matched", "helpful"),
     # Options are `options`, or have the name of their stage, here in the plural or as one word.

@@ -42,8 +42,8 @@ MIN_HEIGHT_M, MAX_HEIGHT_M = -1e4, 1e5
 class PlacedSurface:
     """A surface and how it comes onto a grid.
 
-    geobox : of the grid; grid_crs : its horizontal CRS; vertical_datums : vertical datum of the surface and of the result, None
-    where heights stay as they are; offset_m : subtracted from the heights.
+    geobox : of the grid; grid_crs : its horizontal CRS; vertical_datums : of the surface and of the result, None where
+    heights stay as they are; offset_m : subtracted from the heights.
     """
 
     source: SurfaceInput

@@ -431,11 +431,11 @@ def _text(
     return lines
 
 
-def _measured(cells: SurfaceCells) -> FloatArray:
+def _measured(surface_cells: SurfaceCells) -> FloatArray:
     """Heights (r, c), NaN where they are interpolated. The level of water counts as measured."""
-    height = cells.height.astype(np.float64)
-    if QUALITY in cells.flags:
-        quality = cells.flags[QUALITY].astype(np.uint16)
+    height = surface_cells.height.astype(np.float64)
+    if QUALITY in surface_cells.flags:
+        quality = surface_cells.flags[QUALITY].astype(np.uint16)
         height[(quality & np.uint16(Quality.WATER)) == np.uint16(Quality.FILLED)] = np.nan
     return height
 

@@ -80,18 +80,18 @@ def halo_cells(feather_cells: int) -> int:
     return feather_cells + 2 * NEIGHBOURS + 1
 
 
-def blended(runs: Sequence[SurfaceCells], relations: RunRelations, feather_cells: int) -> BlendedCells:
+def blended(surface_cells: Sequence[SurfaceCells], relations: RunRelations, feather_cells: int) -> BlendedCells:
     """Join runs on one block. Cells closer to the border of the block than `halo_cells` are right only if the block
     ends there.
 
-    runs : in the order in which they were named; feather_cells : distance from its end at which a run has its full
-    weight.
+    surface_cells : of the runs, in the order in which they were named; feather_cells : distance from its end at which
+    a run has its full weight.
     """
-    z = np.stack([run.height for run in runs]).astype(np.float64)
+    z = np.stack([cells.height for cells in surface_cells]).astype(np.float64)
     is_there = np.isfinite(z)
-    sigma = np.stack([run.sigma for run in runs]).astype(np.float64)
+    sigma = np.stack([cells.sigma for cells in surface_cells]).astype(np.float64)
     own_sigma = _known_sigma(sigma, is_there)
-    is_measured = np.stack([_is_measured(run) for run in runs])
+    is_measured = np.stack([_is_measured(cells) for cells in surface_cells])
     weight = _weights(own_sigma, is_there, is_measured, feather_cells)
     chosen = _chosen(z, own_sigma, weight, is_measured, relations)
     any_there = is_there.any(axis=0)
@@ -112,12 +112,12 @@ def blended(runs: Sequence[SurfaceCells], relations: RunRelations, feather_cells
     )  # fmt: skip
 
 
-def _is_measured(run: SurfaceCells) -> NDArray[np.bool_]:
+def _is_measured(surface_cells: SurfaceCells) -> NDArray[np.bool_]:
     """Cells (r, c) whose height is not interpolated. The level of water counts as measured."""
-    is_there = np.isfinite(run.height)
-    if QUALITY not in run.flags:
+    is_there = np.isfinite(surface_cells.height)
+    if QUALITY not in surface_cells.flags:
         return is_there
-    quality = run.flags[QUALITY].astype(np.uint16)
+    quality = surface_cells.flags[QUALITY].astype(np.uint16)
     return np.asarray(is_there & ((quality & np.uint16(Quality.WATER)) != np.uint16(Quality.FILLED)))
 
 

@@ -82,18 +82,19 @@ class MosaicJob:
         return self._block(numbers, [_part(run, core) for run in runs], cells, window)
 
     def _block(
-        self, numbers: Sequence[int], runs: Sequence[SurfaceCells], cells: BlendedCells, window: CellWindow
+        self, numbers: Sequence[int], surface_cells: Sequence[SurfaceCells], cells: BlendedCells, window: CellWindow
     ) -> MosaicBlock:
         shape = (window.rows, window.cols)
         source = np.zeros(shape, np.uint16)
         for place, number in enumerate(numbers):
             source[cells.chosen == place] = number + 1
         layers: dict[str, NDArray[Any]] = {
-            DSM: cells.height, SIGMA: cells.sigma, QUALITY: _quality(runs, cells), SOURCE: source, SEAMS: cells.kind,
+            DSM: cells.height, SIGMA: cells.sigma, SOURCE: source, SEAMS: cells.kind,
+            QUALITY: _quality(surface_cells, cells),
         }  # fmt: skip
         for name in self.has:
             layers[name] = np.zeros(shape, np.uint8)
-            for place, run in enumerate(runs):
+            for place, run in enumerate(surface_cells):
                 if name in run.flags:
                     here = cells.chosen == place
                     layers[name][here] = np.minimum(run.flags[name], 255)[here]
@@ -185,16 +186,17 @@ def reaching(windows: Sequence[CellWindow], window: CellWindow) -> list[int]:
     return [number for number, each in enumerate(common) if each.rows > 0 and each.cols > 0]
 
 
-def _part(run: SurfaceCells, core: tuple[slice, slice]) -> SurfaceCells:
-    flags = {name: values[core] for name, values in run.flags.items()}
-    return SurfaceCells(run.height[core], run.sigma[core], run.is_inside[core], flags)
+def _part(surface_cells: SurfaceCells, core: tuple[slice, slice]) -> SurfaceCells:
+    flags = {name: values[core] for name, values in surface_cells.flags.items()}
+    height, sigma = surface_cells.height[core], surface_cells.sigma[core]
+    return SurfaceCells(height, sigma, surface_cells.is_inside[core], flags)
 
 
-def _quality(runs: Sequence[SurfaceCells], cells: BlendedCells) -> NDArray[np.uint16]:
+def _quality(surface_cells: Sequence[SurfaceCells], cells: BlendedCells) -> NDArray[np.uint16]:
     """Flags (r, c): those of the chosen run, DISPUTED where runs contradict each other; of empty cells the reason of
     the first run that reaches them."""
     quality = np.full(cells.chosen.shape, Quality.OUTSIDE, np.uint16)
-    for run in reversed(runs):
+    for run in reversed(surface_cells):
         reasons = (
             run.flags[QUALITY].astype(np.uint16) & np.uint16(EMPTY | Quality.IMAGE_EXCLUDED)
             if QUALITY in run.flags
@@ -202,7 +204,7 @@ def _quality(runs: Sequence[SurfaceCells], cells: BlendedCells) -> NDArray[np.ui
         )
         known = run.is_inside & (reasons != 0) & ((reasons & np.uint16(Quality.OUTSIDE)) == 0)
         quality = np.where(known, reasons, quality)
-    for place, run in enumerate(runs):
+    for place, run in enumerate(surface_cells):
         own = run.flags[QUALITY].astype(np.uint16) if QUALITY in run.flags else np.zeros_like(quality)
         quality = np.where(cells.chosen == place, own, quality)
     contradicted = cells.kind == SeamKind.CHOSEN

@@ -83,21 +83,21 @@ class RunOffsets:
 
 
 def sampled_pairs(
-    runs: Mapping[int, SurfaceCells], row: int, col: int, seed: int = 0
+    surface_cells: Mapping[int, SurfaceCells], row: int, col: int, seed: int = 0
 ) -> dict[tuple[int, int], PairSample]:
     """Differences of all pairs of runs in one window of the grid, by their numbers.
 
     row, col : place of the window's first cell in the grid, a multiple of `BLOCK_CELLS`.
     """
-    good = {number: _good_heights(run) for number, run in runs.items()}
+    good = {number: _good_heights(run) for number, run in surface_cells.items()}
     found = {}
     rng = np.random.default_rng([seed, row, col])
-    numbers = sorted(runs)
+    numbers = sorted(surface_cells)
     for place, first in enumerate(numbers):
         for second in numbers[place + 1 :]:
             difference = good[second] - good[first]
             if np.isfinite(difference).any():
-                sigmas = np.stack([runs[first].sigma, runs[second].sigma], axis=-1)
+                sigmas = np.stack([surface_cells[first].sigma, surface_cells[second].sigma], axis=-1)
                 sample = _sample(difference, sigmas, (row // BLOCK_CELLS, col // BLOCK_CELLS), rng)
                 if len(sample.median):
                     found[first, second] = sample
@@ -216,11 +216,11 @@ def as_record(offsets: RunOffsets, names: Sequence[str], is_removed: bool) -> di
     }  # fmt: skip
 
 
-def _good_heights(run: SurfaceCells) -> NDArray[np.float64]:
+def _good_heights(surface_cells: SurfaceCells) -> NDArray[np.float64]:
     """Heights (r, c), NaN where they are doubtful."""
-    z = run.height.astype(np.float64)
-    if QUALITY in run.flags:
-        z[(run.flags[QUALITY].astype(np.uint16) & np.uint16(LEFT_OUT)) != 0] = np.nan
+    z = surface_cells.height.astype(np.float64)
+    if QUALITY in surface_cells.flags:
+        z[(surface_cells.flags[QUALITY].astype(np.uint16) & np.uint16(LEFT_OUT)) != 0] = np.nan
     return z
 
 
