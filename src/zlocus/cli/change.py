@@ -10,6 +10,7 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
+from zlocus.cli.evaluate import Geoid
 from zlocus.cli.shared_options import Overwrite, ResultFolder
 from zlocus.core.surface_requests import ChangeRequest
 
@@ -40,6 +41,7 @@ class ChangeOptions:
     keep_offset: Annotated[
         bool, typer.Option("--keep-offset", help="Leave the vertical offset of unchanged ground in the differences.")
     ] = False
+    geoid: Geoid = None
     overwrite: Overwrite = False
 
 
@@ -47,7 +49,8 @@ def change(options: ChangeOptions, console: Console) -> Answer:
     """Subtract two surfaces: what was raised or lowered significantly, and volumes inside polygons."""
     request = ChangeRequest(
         first=options.first, second=options.second, out=options.out, area=options.area, name=options.name,
-        stable=options.stable, level=options.level, keep_offset=options.keep_offset, overwrite=options.overwrite,
+        stable=options.stable, geoid=options.geoid, level=options.level, keep_offset=options.keep_offset,
+        overwrite=options.overwrite,
     )  # fmt: skip
     from zlocus.pipeline.change import run_change
 

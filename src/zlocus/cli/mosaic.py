@@ -10,6 +10,7 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
+from zlocus.cli.evaluate import Geoid
 from zlocus.cli.shared_options import RESULT, RUN, Overwrite, ResultFolder
 from zlocus.core.surface_requests import MosaicRequest
 
@@ -57,15 +58,16 @@ class MosaicOptions:
     scheduler: Annotated[
         str | None, typer.Option(help="Dask cluster that joins the blocks.", metavar="ADDRESS", rich_help_panel=RUN)
     ] = None
+    geoid: Geoid = None
     overwrite: Overwrite = False
 
 
 def mosaic(options: MosaicOptions, console: Console) -> Answer:
     """Join the surfaces of several runs, weighted by their precision, without steps at their seams."""
     request = MosaicRequest(
-        inputs=tuple(options.inputs), out=options.out, like=options.like, feather_m=options.feather,
-        keep_offsets=options.keep_offsets, workers=options.workers, scheduler=options.scheduler,
-        overwrite=options.overwrite,
+        inputs=tuple(options.inputs), out=options.out, like=options.like, geoid=options.geoid,
+        feather_m=options.feather, keep_offsets=options.keep_offsets, workers=options.workers,
+        scheduler=options.scheduler, overwrite=options.overwrite,
     )  # fmt: skip
     from zlocus.pipeline.mosaic import run_mosaic
 

@@ -24,9 +24,9 @@ class MosaicRequest:
     """Surfaces to be joined. `None` means: not given.
 
     inputs : folders of runs and rasters of heights, see `zlocus.io.surface_inputs.surface_input`; out : folder of the
-    result; like : raster whose grid is taken, None: that of the first input, extended; feather_m : distance from the
-    end of a run at which it has its full weight, m, None: 32 cells; keep_offsets : whether heights stay where runs have
-    a vertical offset; workers : blocks worked on at a time; scheduler : address of a Dask cluster that works on them
+    result; like : raster whose grid is taken, None: that of the first input, extended; geoid : raster or name of the
+    geoid of heights that are not ellipsoidal; feather_m : distance from the end of a run at which it has its full
+    weight, m, None: 32 cells; keep_offsets : whether heights stay where runs have a vertical offset; workers : blocks worked on at a time; scheduler : address of a Dask cluster that works on them
     instead; overwrite : whether another result in `out` is replaced.
 
     Raises
@@ -38,6 +38,7 @@ class MosaicRequest:
     inputs: tuple[str, ...]
     out: Path
     like: Path | None = None
+    geoid: Path | None = None
     feather_m: float | None = None
     keep_offsets: bool = False
     workers: int | None = None
@@ -61,8 +62,9 @@ class ChangeRequest:
 
     first, second : earlier and later surface, as `MosaicRequest.inputs`; out : folder of the result; area : polygons
     whose volumes are wanted; name : attribute of theirs that names them; stable : polygons of ground that has not
-    changed, None: all ground outside of `area`; level : probability below which a change of a cell is significant;
-    keep_offset : whether the offset of stable ground stays; overwrite : whether another result in `out` is replaced.
+    changed, None: all ground outside of `area`; geoid : as of `MosaicRequest`; level : probability below which a change
+    of a cell is significant; keep_offset : whether the offset of stable ground stays; overwrite : whether another
+    result in `out` is replaced.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class ChangeRequest:
     area: Path | None = None
     name: str | None = None
     stable: Path | None = None
+    geoid: Path | None = None
     level: float = 0.05
     keep_offset: bool = False
     overwrite: bool = False

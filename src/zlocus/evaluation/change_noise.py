@@ -159,15 +159,17 @@ def change_noise(windows: Sequence[StableWindow], cell_m: float, is_known: bool)
     offset = float(np.median(d))
     size = np.abs(d - offset) / sigma
     spread = NMAD * float(np.median(size))
-    usual = size < MAX_SPREADS * max(spread, 1e-12)
-    scale = float(np.sqrt(np.mean(size[usual] ** 2))) if is_known else spread
-    scale = max(scale, 1e-9)
     shares = np.array(SHARES if is_known else SHARES_OF_UNKNOWN)
     normal = norm.ppf((1.0 + shares) / 2.0)
-    quantiles = np.maximum.accumulate(np.maximum(np.quantile(size, shares), 1e-9 * np.arange(1, len(shares) + 1)))
-    quantiles = _rising(quantiles)
-    if not is_known:
-        quantiles[-1] = max(quantiles[-1], float((quantiles / normal).max()) * normal[-1])
+    if spread > 0:
+        usual = size < MAX_SPREADS * spread
+        scale = float(np.sqrt(np.mean(size[usual] ** 2))) if is_known else spread
+        quantiles = _rising(np.quantile(size, shares))
+        if not is_known:
+            quantiles[-1] = max(quantiles[-1], float((quantiles / normal).max()) * normal[-1])
+    else:
+        # Most heights are the same in both, which says nothing of the others.
+        scale, quantiles = 1.0, normal
     correlation = fitted_correlation(windows, offset, spread, cell_m)
     rng = np.random.default_rng(SEED)
     first, second = (places[rng.integers(0, len(places), N_PAIRS)] for _ in range(2))
@@ -182,7 +184,7 @@ def change_noise(windows: Sequence[StableWindow], cell_m: float, is_known: bool)
 
 def _rising(quantiles: FloatArray) -> FloatArray:
     """Quantiles that rise everywhere, as interpolation needs."""
-    return np.maximum.accumulate(quantiles + 1e-12 * np.arange(len(quantiles)))
+    return np.maximum.accumulate(quantiles + 1e-9 * quantiles.max() * np.arange(1, len(quantiles) + 1))
 
 
 def _places(window: StableWindow) -> NDArray[np.int64]:

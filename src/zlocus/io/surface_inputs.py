@@ -26,6 +26,7 @@ from zlocus.io.vertical import (
     VerticalDatum,
     check_heights,
     declared_vertical_datum,
+    named_vertical_datum,
     vertical_part,
 )
 
@@ -81,9 +82,8 @@ class SurfaceInput:
         """Mean side of a cell, in units of the CRS."""
         return math.sqrt(abs(self.transform.determinant))
 
-    @property
-    def vertical_datum(self) -> VerticalDatum:
-        """What the heights are above.
+    def vertical_datum(self, geoid: Path | None) -> VerticalDatum:
+        """What the heights are above. geoid : raster or name of the geoid of heights that are not ellipsoidal.
 
         Raises
         ------
@@ -92,7 +92,9 @@ class SurfaceInput:
         """
         if self.datum in (None, ELLIPSOID):
             return ELLIPSOIDAL
-        return declared_vertical_datum(CRS.from_wkt(self.spatial_wkt), self.dsm, "--vertical")
+        if geoid is not None:
+            return named_vertical_datum(str(geoid), "--geoid")
+        return declared_vertical_datum(CRS.from_wkt(self.spatial_wkt), self.dsm, "--geoid")
 
 
 def surface_input(given: str | Path) -> SurfaceInput:
@@ -202,10 +204,10 @@ def has_same_cells(surface: SurfaceInput, geobox: GeoBox, crs: CRS | None) -> bo
     return all(abs(x - first[0]) < SAME_GRID and abs(y - first[1]) < SAME_GRID for x, y in steps)
 
 
-def check_joinable(surfaces: Sequence[SurfaceInput]) -> list[str]:
+def check_joinable(surfaces: Sequence[SurfaceInput], geoid: Path | None = None) -> list[str]:
     """Check that surfaces can be brought onto the grid of the first, and say what has to be assumed or converted.
 
-    The result is a list of sentences for the user.
+    The result is a list of sentences for the user. geoid : see `SurfaceInput.vertical_datum`.
 
     Raises
     ------
@@ -238,7 +240,9 @@ def check_joinable(surfaces: Sequence[SurfaceInput]) -> list[str]:
             )
     stated = stating_datum(surfaces)
     for other in surfaces:
-        said += _datum_sentences(stated, other)
+        said += _datum_sentences(stated, other, geoid)
+    if geoid is not None and len({surface.datum for surface in surfaces if surface.datum is not None}) < 2:
+        raise ConfigError(f"--geoid {geoid} is not needed: no two vertical datums differ. Leave it out.")
     return said
 
 
@@ -247,18 +251,26 @@ def stating_datum(surfaces: Sequence[SurfaceInput]) -> SurfaceInput:
     return next((surface for surface in surfaces if surface.datum is not None), surfaces[0])
 
 
-def _datum_sentences(first: SurfaceInput, other: SurfaceInput) -> list[str]:
+def _datum_sentences(first: SurfaceInput, other: SurfaceInput, geoid: Path | None) -> list[str]:
     """What has to be assumed about, or done with, the vertical datum of a surface beside that of another."""
     if first.datum == other.datum:
         return []
     if other.datum is None:
         return [f"{other.path} does not state its vertical datum: taken to be {_above(first.datum)}."]
+    both = (
+        f"The heights of {first.path} are above {_above(first.datum)} and those of {other.path} above "
+        f"{_above(other.datum)}"
+    )
+    if geoid is not None and ELLIPSOID not in (first.datum, other.datum):
+        raise InputError(f"{both}: one geoid is not enough. Convert one of them to the ellipsoid (gdalwarp -t_srs).")
     try:
-        names = [surface.vertical_datum.name for surface in (first, other)]
+        names = [surface.vertical_datum(geoid).name for surface in (first, other)]
     except InputError as error:
+        if geoid is not None:
+            raise
         raise InputError(
-            f"The heights of {first.path} are above {_above(first.datum)} and those of {other.path} above "
-            f"{_above(other.datum)}, and zlocus has no geoid between them. Convert one of them (gdalwarp -t_srs)."
+            f"{both}, and zlocus has no geoid between them. Give it with --geoid RASTER, or convert one of them "
+            "(gdalwarp -t_srs)."
         ) from error
     if names[0] == names[1]:
         return []
@@ -268,12 +280,14 @@ def _datum_sentences(first: SurfaceInput, other: SurfaceInput) -> list[str]:
     ]
 
 
-def converted_datums(first: SurfaceInput, other: SurfaceInput) -> tuple[VerticalDatum, VerticalDatum] | None:
+def converted_datums(
+    first: SurfaceInput, other: SurfaceInput, geoid: Path | None
+) -> tuple[VerticalDatum, VerticalDatum] | None:
     """Vertical datum of a surface, and that of the first to which its heights have to be brought; None where they need
-    not."""
+    not. geoid : see `SurfaceInput.vertical_datum`."""
     if None in (first.datum, other.datum) or first.datum == other.datum:
         return None
-    datums = other.vertical_datum, first.vertical_datum
+    datums = other.vertical_datum(geoid), first.vertical_datum(geoid)
     return None if datums[0].name == datums[1].name else datums
 
 

@@ -171,10 +171,12 @@ def _pair(
     """The surfaces on the common grid: that of the one with the larger cells, where both lie."""
     first, second = surfaces
     by_cell = (second, first) if _is_coarser(second, first) else (first, second)
-    for sentence in check_joinable(by_cell):
+    for sentence in check_joinable(by_cell, request.geoid):
         progress.note(sentence)
     base, stated = by_cell[0], stating_datum(surfaces)
-    placed = [PlacedSurface(each, base.geobox, base.crs, converted_datums(stated, each)) for each in surfaces]
+    placed = [
+        PlacedSurface(each, base.geobox, base.crs, converted_datums(stated, each, request.geoid)) for each in surfaces
+    ]
     common = placed[0].window.within(placed[1].window)
     if not (common.rows and common.cols):
         raise InputError(
@@ -246,7 +248,8 @@ def _noise(pair: _Pair, progress: Progress) -> tuple[_Pair, ChangeNoise]:
         pair = replace(pair, extra_sigma_m=extra)
         windows = [replace(each, sigma=np.hypot(each.sigma, extra)) for each in windows]
         silent = pair.placed[states.index(False)].source.path
-        progress.note(f"{silent} states no standard deviation: {extra:.3g} m, by the differences of unchanged ground.")
+        found = f"{extra:.3g} m" if extra else "less than that of the other surface"
+        progress.note(f"{silent} states no standard deviation: {found}, by the differences of unchanged ground.")
     elif not any(states):
         progress.note(
             "Neither surface states standard deviations: all differences count as equally precise, by their spread on "

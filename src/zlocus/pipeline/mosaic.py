@@ -26,7 +26,6 @@ from zlocus.io.run_folder import RECORD
 from zlocus.io.run_record import Stopwatch, inputs_record, request_as_dict, utc_now, versions_record, write_record
 from zlocus.io.surface_cells import PlacedSurface
 from zlocus.io.surface_inputs import (
-    SIGMA,
     VIEWS,
     WATER,
     SurfaceInput,
@@ -116,7 +115,7 @@ def run_mosaic(request: MosaicRequest, progress: Progress) -> MosaicResult:
         check_output(request.out, request.overwrite, MOSAIC_FILES, "result")
         if len(surfaces) > MAX_RUNS:
             raise ConfigError(f"{len(surfaces)} surfaces are too many for one mosaic. Join up to {MAX_RUNS} at a time.")
-        for sentence in check_joinable(surfaces):
+        for sentence in check_joinable(surfaces, request.geoid):
             progress.note(sentence)
         placement = _placement(request, surfaces)
     _note_resampling(placement, progress)
@@ -171,7 +170,7 @@ def _placement(request: MosaicRequest, surfaces: tuple[SurfaceInput, ...]) -> _P
                 f"{first.dsm} has no CRS, and --like {request.like} has one. Assign it (gdal_edit -a_srs)."
             )
         grid_crs = grid_crs if like_crs == grid_crs else like_crs
-    placed = [PlacedSurface(each, geobox, grid_crs, converted_datums(stated, each)) for each in surfaces]
+    placed = [PlacedSurface(each, geobox, grid_crs, converted_datums(stated, each, request.geoid)) for each in surfaces]
     windows = [each.window for each in placed]
     if request.like is None:
         whole = windows[0]
@@ -263,11 +262,11 @@ def _with_sigmas(placement: _Placement, pairs: Sequence[PairOffset], progress: P
         if surface.has_sigma:
             continue
         sigma_m = float(estimated[number])
-        if math.isfinite(sigma_m) and sigma_m > 0:
+        if math.isfinite(sigma_m):
             surfaces[number] = replace(surface, sigma_m=sigma_m)
             progress.note(
                 f"{surface.path} states no standard deviation: {sigma_m:.3g} m, by its differences from the others. "
-                f"Give another one with {surface.path}=METRES or ={SIGMA.upper()}."
+                f"Give another one with {surface.dsm}=METRES or {surface.dsm}=RASTER."
             )
         else:
             progress.note(
@@ -397,7 +396,7 @@ def _text(
         wide = [pair for pair in offsets.pairs if math.isfinite(pair.scale)]
         if wide:
             worst = max(pair.scale for pair in wide)
-            lines.append(f"differences of runs are up to {worst:.2f} times as large as their standard deviations say")
+            lines.append(f"spread of the differences: {worst:.2f} times what the standard deviations say, or less")
     else:
         lines.append("no two surfaces overlap: they stand side by side")
     return "\n".join([*lines, f"{request.out}: {', '.join(names)} written."])

@@ -31,6 +31,10 @@ MAX_ABOVE_NEIGHBOURS = 2.0
 FILLED_WEIGHT = 1e-6
 # Of runs with equal support the one that was named first is chosen: the last one's support counts so much less.
 ORDER_DISCOUNT = 0.1
+# Where all agree, the run with the largest weight of its own is chosen: by this power of it beside the support.
+OWN_POWER = 0.2
+# Smaller weights count as none.
+TINY = 1e-30
 # A weight below this share adds nothing to the standard deviation that would have to be known.
 SMALL_WEIGHT = 0.01
 
@@ -190,8 +194,12 @@ def _chosen(
                 )
                 support += np.where(np.isfinite(apart), weight[other] * _agreement(np.nan_to_num(apart)), 0.0)
         is_there = np.isfinite(z[number])
-        nearby = uniform_filter(np.where(is_there, support, 0.0), 2 * NEIGHBOURS + 1, mode="constant")
-        score[number] = np.log(np.maximum(nearby, 1e-30)) - ORDER_DISCOUNT * number / (n - 1)
+        nearby, own = (
+            uniform_filter(np.where(is_there, each, 0.0), 2 * NEIGHBOURS + 1, mode="constant")
+            for each in (support, weight[number])
+        )
+        score[number] = np.log(np.maximum(nearby, TINY)) + OWN_POWER * np.log(np.maximum(own, TINY))
+        score[number] -= ORDER_DISCOUNT * number / (n - 1)
         score[number][~is_there] = -np.inf
     # An interpolated height never stands for a measured one.
     score[~is_measured & is_measured.any(axis=0)] = -np.inf

@@ -140,7 +140,7 @@ def estimated_sigmas(n_runs: int, pairs: Sequence[PairOffset]) -> NDArray[np.flo
         for run, of_other in ((pair.first, pair.usual_sigmas_m[1]), (pair.second, pair.usual_sigmas_m[0])):
             half = pair.spread_m / math.sqrt(2.0)
             left = pair.spread_m**2 - of_other**2
-            found[run].append(half if not left > 0 else math.sqrt(left))
+            found[run].append(max(math.sqrt(left) if left > 0 else half, SMALLEST_M))
     return np.array([float(np.median(each)) if each else math.nan for each in found])
 
 
