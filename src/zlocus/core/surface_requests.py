@@ -26,8 +26,9 @@ class MosaicRequest:
     inputs : folders of runs and rasters of heights, see `zlocus.io.surface_inputs.surface_input`; out : folder of the
     result; like : raster whose grid is taken, None: that of the first input, extended; geoid : raster or name of the
     geoid of heights that are not ellipsoidal; feather_m : distance from the end of a run at which it has its full
-    weight, m, None: 32 cells; keep_offsets : whether heights stay where runs have a vertical offset; workers : blocks worked on at a time; scheduler : address of a Dask cluster that works on them
-    instead; overwrite : whether another result in `out` is replaced.
+    weight, m, None: 32 cells; keep_offsets : whether heights stay where runs have a vertical offset; workers : blocks
+    worked on at a time; scheduler : address of a Dask cluster that works on them instead; overwrite : whether another
+    result in `out` is replaced.
 
     Raises
     ------
