@@ -21,6 +21,7 @@ OTHER_RESULTS = {
     "orientation.json": ("tie points and corrected cameras", "zlocus orient` or `zlocus ties"),
     "evaluation.json": ("an evaluation", "zlocus evaluate"),
     "compare.html": ("a comparison", "zlocus compare"),
+    "change.json": ("a change between two surfaces", "zlocus change"),
     "scene.yaml": ("a scene, which is an input", "zlocus import"),
 }
 ADVICE = "Give the folder that a finished `zlocus dsm` wrote (-o)."

@@ -30,9 +30,9 @@ MAX_ABOVE_NEIGHBOURS = 2.0
 # Weight of an interpolated height beside a measured one.
 FILLED_WEIGHT = 1e-6
 # Of runs with equal support the one that was named first is chosen: the last one's support counts so much less.
-ORDER_DISCOUNT = 0.1
+ORDER_DISCOUNT = 0.05
 # Where all agree, the run with the largest weight of its own is chosen: by this power of it beside the support.
-OWN_POWER = 0.2
+OWN_POWER = 0.05
 # Smaller weights count as none.
 TINY = 1e-30
 # A weight below this share adds nothing to the standard deviation that would have to be known.
