@@ -23,7 +23,11 @@ NMAD = 1.4826
 # Shares of unchanged cells at which the size of differences is compared with that of normal errors. Where it is not
 # known which ground has changed, only the smaller differences tell.
 SHARES = (0.5, 0.6827, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
-SHARES_OF_UNKNOWN = (0.5, 0.6827, 0.8)
+SHARES_OF_UNKNOWN = (0.5, 0.6827, 0.8, 0.9, 0.95)
+# Above this share, differences of ground that may have changed are looked at on the side (raised or lowered) that has
+# fewer large ones, because change is mostly of one kind; and they count as errors up to this many times those of normal
+# errors, because it may be of both kinds.
+SURE_SHARE, MAX_TAIL = 0.8, 1.5
 # Larger differences, in units of the robust spread, are mismatches: they say nothing of the spread or of correlation.
 MAX_SPREADS = 5.0
 # Ranges of spherical models whose sum is fitted to the correlation, from this many cells on, each so many times the
@@ -164,9 +168,13 @@ def change_noise(windows: Sequence[StableWindow], cell_m: float, is_known: bool)
     if spread > 0:
         usual = size < MAX_SPREADS * spread
         scale = float(np.sqrt(np.mean(size[usual] ** 2))) if is_known else spread
-        quantiles = _rising(np.quantile(size, shares))
+        quantiles = np.quantile(size, shares)
         if not is_known:
-            quantiles[-1] = max(quantiles[-1], float((quantiles / normal).max()) * normal[-1])
+            sides = [np.quantile(size[side], shares) for side in (d >= offset, d <= offset)]
+            sure = shares <= SURE_SHARE
+            most = MAX_TAIL * float((quantiles[sure] / normal[sure]).max()) * normal
+            quantiles = np.where(sure, quantiles, np.minimum(np.minimum(*sides), most))
+        quantiles = _rising(quantiles)
     else:
         # Most heights are the same in both, which says nothing of the others.
         scale, quantiles = 1.0, normal
