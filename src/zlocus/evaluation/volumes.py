@@ -23,7 +23,7 @@ MAX_SIDE = 512
 # Rows of a polygon that are read at a time are chosen so that a strip has about this many cells.
 STRIP_CELLS = 2_000_000
 # Cells whose correlation with unchanged ground is looked at.
-N_PLACES = 100_000
+N_PLACES = 20_000
 # A change is significant where it is larger than this many standard deviations: 5 %, two-sided.
 SIGNIFICANT = 1.96
 # Blocks this close to each other are summed cell by cell.

@@ -18,12 +18,16 @@ import distributed
 import pytest
 
 from interrupted_runs import check_end, command, given_again, n_finished, started, wait_for_tiles
+from overlapping_surfaces import two_runs
 from places import SUPPORT
 from rendered_scenes import N_SMALL_TILES, SMALL_TILES, run
 from worker_tasks import Planted
 from zlocus.core.errors import ConfigError, StoppedError
+from zlocus.core.progress import SilentProgress
+from zlocus.core.surface_requests import MosaicRequest
 from zlocus.pipeline.execution.cluster import Cluster
 from zlocus.pipeline.execution.tasks import Cause, run_tasks
+from zlocus.pipeline.mosaic import run_mosaic
 
 pytestmark = pytest.mark.filterwarnings("ignore::Warning:distributed", "ignore::ResourceWarning")
 BUSY_S = 2.0
@@ -143,6 +147,16 @@ def test_a_scheduler_that_goes_keeps_what_is_done(images, straight, tmp_path):
     assert len((out / "tiles" / "done.jsonl").read_bytes().splitlines()) >= 2
     run(images("sine"), out, SMALL_TILES, report=False)
     assert same(out, straight)
+
+
+def test_a_mosaic_of_a_cluster_has_the_same_bytes(tmp_path):
+    runs = [str(folder) for folder in two_runs(tmp_path, seed=2).folders]
+    run_mosaic(MosaicRequest((*runs,), tmp_path / "here"), SilentProgress())
+    with cluster(tmp_path, 1) as found:
+        request = MosaicRequest((*runs,), tmp_path / "there", scheduler=found.address)
+        run_mosaic(request, SilentProgress())
+    for name in ("dsm.tif", "sigma.tif", "source.tif", "seams.tif", "quality.tif"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes(), name
 
 
 def test_failures_on_a_cluster(tmp_path):
