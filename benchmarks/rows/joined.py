@@ -51,7 +51,8 @@ def change(workplace: Workplace) -> list[Figure]:
             "planted volumes inside their 68 % interval", share, at_least=0.55, at_most=0.80,
             fails_when="errors that many cells share are taken as independent, or the other way round",
         ),
-        Figure("errors of volumes in standard deviations, RMS", float(np.sqrt(np.mean(errors**2)))),
+        Figure("errors of volumes in standard deviations, median size", float(np.median(np.abs(errors)))),
+        Figure("errors of volumes in standard deviations, largest: a mismatch", float(np.abs(errors).max())),
         Figure(
             "unchanged cells called changed at 5 %, worst town", max(each[1] for each in found), at_most=0.06,
             fails_when="stated standard deviations are believed without a look at unchanged ground",

@@ -42,7 +42,7 @@ def test_the_table(zl, dates, tmp_path):
     lines = done.stdout.splitlines()
     assert lines[:2] == [f"A: {first}", f"B: {second}"]
     name, volume, sigma, mean, known = lines[-2].split()
-    assert (name, known) == ("north", "100.0%")
+    assert (name, known) == ("north", "100.0")
     assert float(volume) == pytest.approx(50.0, abs=1.5)
     assert 0.1 < float(sigma) < 1.0
     assert float(mean) == pytest.approx(2.0, abs=0.05)

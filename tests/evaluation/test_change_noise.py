@@ -92,6 +92,19 @@ def test_a_spherical_model():
     assert one.area_m2 == pytest.approx((2.0 * np.pi * r * one.at(r)).sum() * 1e-3, rel=1e-4)
 
 
+def test_gross_errors_are_told_apart():
+    """Patches of 10 x 10 cells of 3 m, one in each block of 64 x 64: the variance of their sums."""
+    rng = np.random.default_rng(7)
+    d = 0.2 * rng.normal(size=(SIDE, SIDE))
+    for row in range(20, SIDE, 64):
+        for col in range(20, SIDE, 64):
+            d[row - 15 : row - 5, col - 15 : col - 5] = 3.0 * rng.choice([-1.0, 1.0])
+    found = change_noise(windows_of(d), CELL_M, is_known=True)
+    assert found.scale == pytest.approx(1.0, rel=0.03)
+    assert found.mismatch_m2 == pytest.approx((100 * 3.0) ** 2 / 64**2, rel=0.03)
+    assert change_noise(windows_of(d), CELL_M, is_known=False).mismatch_m2 == 0.0
+
+
 def test_a_shift_in_plan_is_seen_on_slopes():
     """A surface that lies 0.4 m to the east of another one, on hills."""
     rng = np.random.default_rng(6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,6 +115,15 @@ def test_missing_cells_count_with_the_mean_and_cost_certainty():
     spread = math.sqrt((100 * (3.0 - mean) ** 2 + 50 * (1.0 - mean) ** 2) / 150)
     assert volume.missing_sigma_m3 == pytest.approx(50 * CELL_M**2 * spread)
     assert volume.sigma_m3 > volume.missing_sigma_m3
+
+
+def test_gross_errors_stand_beside_the_others():
+    noise = replace(noise_of(INDEPENDENT), mismatch_m2=4.0)
+    difference = np.full(SHAPE, 0.2)
+    volume = volume_of(box(10, 10, 10, 20), GEOBOX, reader(difference), noise)
+    assert volume.mismatch_sigma_m3 == pytest.approx(CELL_M**2 * math.sqrt(200 * 4.0))
+    assert volume.sigma_m3 == pytest.approx(CELL_M**2 * 0.2 * math.sqrt(200))
+    assert not volume.is_significant
 
 
 def test_a_polygon_beyond_the_grid():

@@ -100,7 +100,8 @@ class ChangeNoise:
     same share; places : (n, 2) row and column of cells of unchanged ground; sigma_m : root mean square of its stated
     standard deviations; mean_correlation : of two random cells of it; n_cells : number; spread_m : robust spread of its
     differences; shift_m : by which the second surface seems to lie to the east and to the north of the first;
-    is_shift_clear : whether its removal would make the differences clearly smaller.
+    is_shift_clear : whether its removal would make the differences clearly smaller; mismatch_m2 : variance of the sum
+    of gross errors over an area, m2 for each cell of it, 0 where unchanged ground is not known.
     """
 
     offset_m: float
@@ -116,6 +117,7 @@ class ChangeNoise:
     spread_m: float
     shift_m: tuple[float, float]
     is_shift_clear: bool
+    mismatch_m2: float = 0.0
 
     def significance(self, difference: FloatArray, sigma: FloatArray, is_removed: bool = True) -> FloatArray:
         """Change in standard deviations of a normal error that is as rare on unchanged ground, with its sign.
@@ -145,6 +147,7 @@ class ChangeNoise:
             "offset_m": round(self.offset_m, 5), "offset_sigma_m": round(self.offset_sigma_m, 5),
             "spread_m": round(self.spread_m, 5), "scale_of_sigmas": round(self.scale, 4), "cells": self.n_cells,
             "correlation": self.correlation.as_dict(),
+            "mismatch_m2_per_cell": round(self.mismatch_m2, 5),
             "horizontal_shift_m": {"east": round(self.shift_m[0], 4), "north": round(self.shift_m[1], 4)},
         }  # fmt: skip
 
@@ -187,7 +190,23 @@ def change_noise(windows: Sequence[StableWindow], cell_m: float, is_known: bool)
     return ChangeNoise(
         offset, scale * sigma_m * math.sqrt(mean_correlation), scale, correlation, quantiles, normal, places, sigma_m,
         mean_correlation, len(d), NMAD * float(np.median(np.abs(d - offset))), shift, is_clear,
+        _mismatch_variance(windows, offset, spread) if is_known else 0.0,
     )  # fmt: skip
+
+
+def _mismatch_variance(windows: Sequence[StableWindow], offset: float, spread: float) -> float:
+    """Variance of the sum of gross errors, m2 for each cell: from their sums over blocks, which hold whole patches."""
+    total, n_cells = 0.0, 0
+    for window in windows:
+        residual = window.difference - offset
+        with np.errstate(invalid="ignore"):
+            is_gross = np.abs(residual) >= MAX_SPREADS * spread * window.sigma
+        gross, known = np.where(is_gross, residual, 0.0), np.isfinite(residual)
+        for r in range(0, gross.shape[0], MEAN_CELLS):
+            for c in range(0, gross.shape[1], MEAN_CELLS):
+                total += float(gross[r : r + MEAN_CELLS, c : c + MEAN_CELLS].sum()) ** 2
+                n_cells += int(known[r : r + MEAN_CELLS, c : c + MEAN_CELLS].sum())
+    return total / max(n_cells, 1)
 
 
 def _rising(quantiles: FloatArray) -> FloatArray:

@@ -55,6 +55,8 @@ class Volume:
     n_cells, n_known : cells with their centre in the polygon, and those of them that both surfaces know; volume_m3,
     sigma_m3 : net volume of the whole polygon, and its standard deviation, NaN where no cell is known; mean_m : mean
     change; missing_sigma_m3, offset_sigma_m3 : parts of the standard deviation from unknown cells and from the offset;
+    mismatch_sigma_m3 : standard deviation of gross errors, if they are as frequent as on unchanged ground, which is not
+    in `sigma_m3`: most polygons have none of them, and a few have large ones;
     raised_m2, lowered_m2, raised_m3, lowered_m3 : area and volume of the cells with a significant change; area_m2 : of
     all cells.
     """
@@ -67,6 +69,7 @@ class Volume:
     mean_m: float
     missing_sigma_m3: float
     offset_sigma_m3: float
+    mismatch_sigma_m3: float
     raised_m2: float
     lowered_m2: float
     raised_m3: float
@@ -79,8 +82,8 @@ class Volume:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the volume differs from 0 at the 5 % level."""
-        return bool(abs(self.volume_m3) > SIGNIFICANT * self.sigma_m3)
+        """Whether the volume differs from 0 at the 5 % level, gross errors included."""
+        return bool(abs(self.volume_m3) > SIGNIFICANT * math.hypot(self.sigma_m3, self.mismatch_sigma_m3))
 
     def as_dict(self) -> dict[str, Any]:
         """The values of a row of the table, by their names."""
@@ -90,7 +93,8 @@ class Volume:
             "sigma_m3": _rounded(self.sigma_m3), "low_68_m3": _rounded(self.volume_m3 - self.sigma_m3),
             "high_68_m3": _rounded(self.volume_m3 + self.sigma_m3), "significant": self.is_significant,
             "mean_m": _rounded(self.mean_m, 5), "sigma_of_missing_m3": _rounded(self.missing_sigma_m3),
-            "sigma_of_offset_m3": _rounded(self.offset_sigma_m3), "raised_m2": round(self.raised_m2, 3),
+            "sigma_of_offset_m3": _rounded(self.offset_sigma_m3),
+            "sigma_of_mismatches_m3": _rounded(self.mismatch_sigma_m3), "raised_m2": round(self.raised_m2, 3),
             "lowered_m2": round(self.lowered_m2, 3), "raised_m3": _rounded(self.raised_m3),
             "lowered_m3": _rounded(self.lowered_m3),
         }  # fmt: skip
@@ -166,7 +170,7 @@ def _volume(sums: _Sums, window: CellWindow, cell_m: float, noise: ChangeNoise, 
     changed = [cell_m2 * each for each in (*sums.counts, *sums.changed)]
     if not sums.n_known:
         nan = math.nan
-        return Volume(sums.n_cells, 0, area, nan, nan, nan, nan, nan, *changed)
+        return Volume(sums.n_cells, 0, area, nan, nan, nan, nan, nan, nan, *changed)
     mean = sums.total / sums.n_known
     spread = math.sqrt(max(sums.squares / sums.n_known - mean**2, 0.0))
     own = correlated_variance(sums.weights, noise.correlation, cell_m, sums.step) / sums.n_known**2
@@ -182,7 +186,8 @@ def _volume(sums: _Sums, window: CellWindow, cell_m: float, noise: ChangeNoise, 
     variance = area**2 * (own + of_offset) + missing**2
     return Volume(
         sums.n_cells, sums.n_known, area, area * mean, math.sqrt(variance), mean, missing,
-        area * (noise.offset_sigma_m if is_removed else abs(noise.offset_m)), *changed,
+        area * (noise.offset_sigma_m if is_removed else abs(noise.offset_m)),
+        cell_m2 * math.sqrt(sums.n_cells * noise.mismatch_m2), *changed,
     )  # fmt: skip
 
 

@@ -147,7 +147,7 @@ def run_change(request: ChangeRequest, progress: Progress) -> ChangeResult:
         write_change_picture(request.out / PICTURE, request.out / DIFFERENCE, request.out / CLASSES, features, noise)
         inputs = inputs_record(
             [path for surface in surfaces for path in surface.files]
-            + [path for path in (request.area, request.stable) if path is not None]
+            + [path for path in (request.area, request.stable, request.geoid) if path is not None and path.is_file()]
         )
         record = _record(request, pair, noise, counts, inputs, stopwatch)
         if features is not None:
@@ -422,14 +422,15 @@ def _text(
         f"unchanged ground: B less A {noise.offset_m:+.3f} +-{noise.offset_sigma_m:.3f} m "
         f"({'kept' if request.keep_offset else 'removed'}), spread {noise.spread_m:.3f} m, {noise.scale:.2f} times "
         f"what the standard deviations say; errors reach over {math.sqrt(noise.correlation.area_m2):.1f} m",
-        f"significant at {100 * request.level:g} %: {shares[0]:.1%} of {known} cells raised, {shares[1]:.1%} lowered",
+        f"significant at {100 * request.level:g} %: {100 * shares[0]:.1f} % of {known} cells raised, "
+        f"{100 * shares[1]:.1f} % lowered",
     ]  # fmt: skip
     if features is not None:
-        lines.append(f"{'polygon':<16} {'volume, m3':>14} {'+- (68 %)':>12} {'mean, m':>9} {'known':>7}")
+        lines.append(f"{'polygon':<16} {'volume, m3':>14} {'+- (68 %)':>12} {'mean, m':>9} {'known, %':>9}")
         for name, each in zip(_names(features), volumes, strict=True):
             lines.append(
                 f"{name[:16]:<16} {each.volume_m3:>14.1f} {each.sigma_m3:>12.1f} {each.mean_m:>9.3f} "
-                f"{each.known_share:>7.1%}{'' if each.is_significant else '  not significant'}"
+                f"{100 * each.known_share:>9.1f}{'' if each.is_significant else '  not significant'}"
             )
     return lines
 

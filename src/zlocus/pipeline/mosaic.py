@@ -133,7 +133,8 @@ def run_mosaic(request: MosaicRequest, progress: Progress) -> MosaicResult:
             names, counts, n_of_run = _write(request, placement, job, usage, progress)
         write_picture(request.out, [str(surface.path) for surface in surfaces])
         with stopwatch.stage("checksums"), progress.stage("Checksums of the inputs"):
-            inputs = inputs_record([path for surface in surfaces for path in surface.files])
+            more = [path for path in (request.like, request.geoid) if path is not None and path.is_file()]
+            inputs = inputs_record([path for surface in surfaces for path in surface.files] + more)
         record = {
             "command": COMMAND, "created": utc_now(), "started_in": str(Path.cwd()),
             "config": {"request": request_as_dict(request)}, "versions": versions_record(), "inputs": inputs,
