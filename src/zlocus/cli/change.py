@@ -10,8 +10,7 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
-from zlocus.cli.evaluate import Geoid
-from zlocus.cli.shared_options import Overwrite, ResultFolder
+from zlocus.cli.shared_options import Overwrite, ResultFolder, SurfaceGeoid
 from zlocus.core.surface_requests import ChangeRequest
 
 SURFACE = "Folder that `zlocus dsm` wrote, or a raster of heights, or RASTER=SIGMA as of `zlocus mosaic`"
@@ -41,7 +40,7 @@ class ChangeOptions:
     keep_offset: Annotated[
         bool, typer.Option("--keep-offset", help="Leave the vertical offset of unchanged ground in the differences.")
     ] = False
-    geoid: Geoid = None
+    geoid: SurfaceGeoid = None
     overwrite: Overwrite = False
 
 

@@ -10,8 +10,7 @@ import typer
 
 from zlocus.cli.answer import Answer
 from zlocus.cli.console import Console
-from zlocus.cli.evaluate import Geoid
-from zlocus.cli.shared_options import RESULT, RUN, Overwrite, ResultFolder
+from zlocus.cli.shared_options import RESULT, RUN, Overwrite, ResultFolder, SurfaceGeoid
 from zlocus.core.surface_requests import MosaicRequest
 
 
@@ -58,7 +57,7 @@ class MosaicOptions:
     scheduler: Annotated[
         str | None, typer.Option(help="Dask cluster that joins the blocks.", metavar="ADDRESS", rich_help_panel=RUN)
     ] = None
-    geoid: Geoid = None
+    geoid: SurfaceGeoid = None
     overwrite: Overwrite = False
 
 

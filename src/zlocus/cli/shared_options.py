@@ -101,4 +101,11 @@ DryRun = Annotated[
     typer.Option("--dry-run", help="Print the plan, which takes tie points, and make nothing.", rich_help_panel=RUN),
 ]
 SurfaceFolderArgument = Annotated[Path, typer.Argument(help="Folder of a surface made by `zlocus dsm`.", metavar="OUT")]
+SurfaceGeoid = Annotated[
+    Path | None,
+    typer.Option(
+        help="Geoid of the heights that are not ellipsoidal, where vertical datums differ. Default: what the CRS says.",
+        metavar="RASTER",
+    ),
+]
 Reference = Annotated[Path | None, typer.Option(help="Raster of reference heights to compare with.", metavar="RASTER")]
