@@ -28,6 +28,7 @@ RUN_BY = {
     "judging.py": "test_surfaces.py::test_the_benchmark_of_the_choice_of_views",
     "independent_surfaces.py": "test_real_images.py::test_two_surfaces_disagree_in_exactly_the_planted_share",
     "large.py": "test_speed.py::test_growth_is_measured_and_kept",
+    "rows/joined.py": "test_joined_row.py::test_runs_are_joined_and_changed",
     "rows/large_areas.py": "test_speed.py::test_what_a_wider_halo_changes",
     "lines_of_sight.py": "test_real_images.py::test_a_tower_occludes_what_lies_behind_it_in_a_view_with_rpc",
     "machine.py": "test_speed.py::test_rates_of_a_core_are_measured",

@@ -23,6 +23,7 @@ import made_up_deliveries as deliveries
 from facade_scene import axes_of_wall, photographed
 from geoids import write_geoid, write_proj_grid
 from grid_input_files import write_water
+from overlapping_surfaces import CORNER, town, two_runs, write_raster, write_run
 from places import ROOT
 from point_files import cloud, csv
 from rendered_scenes import CENTRE, GSD_M, QUIET, UTM, rendered
@@ -117,6 +118,29 @@ def lay_out_images_and_area(folder: Path) -> None:
     lay_out_images(folder)
     (x, y), side = CENTRE, 15.0
     ring = [[x, y], [x + side, y], [x + side, y + side], [x, y + side], [x, y]]
+    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}
+    area = {"type": "FeatureCollection", "crs": crs, "features": [feature]}
+    (folder / "town.geojson").write_text(json.dumps(area), encoding="utf-8")
+
+
+def lay_out_strips(folder: Path) -> None:
+    """Two runs that overlap, and heights of a raster."""
+    runs = two_runs(folder, seed=1)
+    for run, name in zip(runs.folders, ("north", "south"), strict=True):
+        run.rename(folder / name)
+    write_raster(folder / "reference.tif", runs.truth.astype(np.float32))
+
+
+def lay_out_dates(folder: Path) -> None:
+    """Runs of two dates, heights of a raster, and polygons."""
+    lay_out_strips(folder)
+    truth = town(180, 240)
+    rng = np.random.default_rng(2)
+    for name in ("spring", "autumn"):
+        write_run(folder / name, truth + 0.1 * rng.normal(size=truth.shape), np.full(truth.shape, 0.1))
+    (west, north), (east, south) = CORNER * (50, 50), CORNER * (90, 90)
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
     crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32632"}}
     area = {"type": "FeatureCollection", "crs": crs, "features": [feature]}
@@ -303,7 +327,7 @@ LAID_OUT = {
     "README.md": lay_out_readme,
     "docs/how-to/align.md": lay_out_points,
     "docs/how-to/array_jobs.md": lay_out_images,
-    "docs/how-to/change.md": lay_out_images_and_area,
+    "docs/how-to/change.md": lay_out_dates,
     "docs/how-to/cloud.md": lay_out_images_and_area,
     "docs/how-to/compare.md": lay_out_images,
     "docs/how-to/curves.md": lay_out_images,
@@ -314,7 +338,7 @@ LAID_OUT = {
     "docs/how-to/inspect.md": lay_out_images,
     "docs/how-to/large.md": lay_out_images,
     "docs/how-to/masks.md": lay_out_masked,
-    "docs/how-to/mosaic.md": lay_out_images,
+    "docs/how-to/mosaic.md": lay_out_strips,
     "docs/how-to/orient.md": lay_out_images,
     "docs/how-to/report.md": lay_out_comparison,
     "docs/how-to/vertical.md": lay_out_datums,
