@@ -82,6 +82,9 @@ def test_points_in_a_hole_are_missing_and_points_of_unknown_accuracy_are_said(tm
     assert "the accuracy of the points is not known and not included in RMSE_V" in text
     given = judged(level, path, PointOptions(sigma_m=0.03))
     assert given.nva.rmse_v == pytest.approx(0.03, abs=EXACT_M)
+    at_rim = csv(tmp_path / "r.csv", {"x": WEST + 10.1 + np.arange(3), "y": [NORTH - 0.1] * 3, "z": [100.0] * 3})
+    shift = judged(level, at_rim).evaluation.found_shift
+    assert shift.undetermined == "fewer than 3 points lie between four cells with heights"
     only_hole = csv(tmp_path / "q.csv", {"x": [WEST + 3], "y": [NORTH - 3], "z": [100.0]})
     with pytest.raises(InputError, match="has no height at any of the 1 points"):
         judged(level, only_hole)

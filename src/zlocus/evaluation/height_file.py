@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -109,11 +110,19 @@ class HeightFile:
 
     def bilinear(self, xy: FloatArray) -> FloatArray:
         """Heights (n,) m at points, see `HeightRaster.bilinear`; NaN outside."""
+        return self._looked_up(xy, HeightRaster.bilinear)
+
+    def has_four(self, xy: FloatArray) -> NDArray[np.bool_]:
+        """Whether points (n, 2) lie between four cells that all have a height."""
+        return np.isfinite(self._looked_up(xy, HeightRaster.between_cells))
+
+    def _looked_up(self, xy: FloatArray, look_up: Callable[[HeightRaster, FloatArray], FloatArray]) -> FloatArray:
+        """Heights (n,) m at points, block by block; NaN outside."""
         z, inside = np.full(len(xy), np.nan), np.flatnonzero(self.inside(xy))
         if not len(inside):
             return z
         for (row, col), part in self.blocks_of(xy[inside]).items():
             side = BLOCK + 2 * RIM
             window = self.window(row * BLOCK - RIM, col * BLOCK - RIM, side, side)
-            z[inside[part]] = window.bilinear(xy[inside[part]])
+            z[inside[part]] = look_up(window, xy[inside[part]])
         return z

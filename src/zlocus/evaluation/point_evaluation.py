@@ -180,8 +180,8 @@ def _shift(height_file: HeightFile, points: KnownPoints, errors: FloatArray) -> 
     """The shift of the surface against points; its height is the median error after the horizontal shift."""
     if not in_metres(height_file.horizontal):
         reason = "the surface is not on a map in metres"
-    elif np.count_nonzero(np.isfinite(errors)) < MIN_FOR_HEIGHT:
-        reason = f"fewer than {MIN_FOR_HEIGHT} points are compared"
+    elif np.count_nonzero(height_file.has_four(points.xyz[:, :2])) < MIN_FOR_HEIGHT:
+        reason = f"fewer than {MIN_FOR_HEIGHT} points lie between four cells with heights"
     else:
         fit = fit_surface(sample_around(height_file, points, MAX_SHIFT_M), MAX_SHIFT_M)
         if fit.undetermined is None:
