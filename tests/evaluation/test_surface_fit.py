@@ -33,6 +33,7 @@ FLAT = {
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch):
     monkeypatch.setattr(fit_sample, "MAX_POINTS", 20_000)
+    monkeypatch.setattr(fit_sample, "MAX_PLACES", 60_000)
 
 
 def fitted(dsm, points, max_shift_m=MAX_SHIFT_M, **options):
