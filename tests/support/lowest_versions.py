@@ -12,7 +12,7 @@ from packaging.requirements import Requirement
 
 from places import ROOT
 
-EXTRAS = ("cluster", "inspect", "xarray")
+EXTRAS = ("cluster", "inspect", "parquet", "xarray")
 
 
 def requirements(extras: tuple[str, ...] = EXTRAS) -> list[Requirement]:
