@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +34,8 @@ from zlocus.cli.shared_options import (
     Settings,
     Vertical,
 )
+from zlocus.core.errors import ConfigError
+from zlocus.core.redo_request import RedoRequest
 from zlocus.core.requests import (
     DEFAULT_PRODUCTS,
     METHODS,
@@ -48,6 +50,8 @@ MAPS_HELP = (
     f"Maps to make beside the {' and the '.join(DEFAULT_PRODUCTS)}: "
     f"{', '.join(name for name in PRODUCTS if name not in DEFAULT_PRODUCTS)} (separated by commas); none: no map."
 )
+
+REDO = "A part of a finished run"
 
 
 @dataclass(frozen=True)
@@ -161,6 +165,40 @@ class DsmOptions:
     )
     config: ConfigFile = None
     settings: Settings = None
+    redo: Annotated[
+        Path | None,
+        typer.Option(
+            help="Make only the cells inside these polygons of the finished run in -o again, with the options given "
+            "here in place of its own.",
+            metavar="VECTOR",
+            rich_help_panel=REDO,
+        ),
+    ] = None
+    redo_margin: Annotated[
+        float | None,
+        typer.Option(
+            help="Width inside the polygons on which old and new heights are blended, m. Default: 8 cells.",
+            metavar="M",
+            rich_help_panel=REDO,
+        ),
+    ] = None
+    break_lines: Annotated[
+        Path | None,
+        typer.Option(
+            help="Lines that hold the surface at their heights, or without heights let it jump across them.",
+            metavar="VECTOR",
+            rich_help_panel=REDO,
+        ),
+    ] = None
+    level: Annotated[
+        str | None,
+        typer.Option(
+            help="Level of all cells inside the polygons, m, or the attribute of the polygons that holds it. Nothing "
+            "is matched.",
+            metavar="M|FIELD",
+            rich_help_panel=REDO,
+        ),
+    ] = None
     dry_run: DryRun = False
 
 
@@ -186,6 +224,13 @@ def dsm_request(options: DsmOptions) -> DsmRequest:
 def dsm(options: DsmOptions, console: Console) -> Answer:
     """Make a digital surface model from images."""
     request = dsm_request(options)
+    if options.redo is not None:
+        return redo(options, request, console)
+    for name, value in (
+        ("redo-margin", options.redo_margin), ("break-lines", options.break_lines), ("level", options.level)
+    ):  # fmt: skip
+        if value is not None:
+            raise ConfigError(f"--{name} {value} is given without --redo. Give both, or leave it out.")
     check_output(request.out, request.overwrite, may_be_same=True)
     config = config_of(options.config, options.settings)
     if options.dry_run:
@@ -200,3 +245,20 @@ def dsm(options: DsmOptions, console: Console) -> Answer:
         result.sentence,
         {**result.as_dict(), "notes": console.notes},
     )
+
+
+def redo(options: DsmOptions, request: DsmRequest, console: Console) -> Answer:
+    """Make a part of a finished surface again."""
+    if options.dry_run:
+        raise ConfigError("--dry-run plans whole runs, and not --redo. Leave one out.")
+    assert options.redo is not None, "callers make sure"
+    # Not given: the method of the run, and not the usual one.
+    asked = request if options.method is not None else replace(request, method=DsmRequest.method)
+    part = RedoRequest(
+        surface=asked, area=options.redo, margin_m=options.redo_margin, break_lines=options.break_lines,
+        level=options.level, config=options.config, settings=tuple(options.settings or ()),
+    )  # fmt: skip
+    from zlocus.pipeline.redo import run_redo
+
+    result = run_redo(part, console.progress)
+    return Answer(result.sentence, {**result.as_dict(), "notes": console.notes})

@@ -41,6 +41,7 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import FILES, link_all, write_derived
     from zlocus.products.report.file_names import REPORT
+    from zlocus.products.metadata import METADATA
 
     existing_file(options.out / "dsm.tif", "surface")
     if options.config is None:
@@ -50,7 +51,7 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     progress = console.progress
     write_derived(options.out, chosen, product_options, progress)
     link_all(options.out, progress)
-    update_finished(options.out, (*(FILES[name] for name in chosen), ITEM))
+    update_finished(options.out, (*(FILES[name] for name in chosen), ITEM, METADATA))
     made = [FILES[name] for name in chosen]
     shown = f" `zlocus report {options.out}` shows them." if made and (options.out / REPORT).exists() else ""
     return Answer(f"{options.out}: {', '.join(made) or 'no map'} made.{shown}", {"products": made})

@@ -37,13 +37,14 @@ def report(options: ReportOptions, console: Console) -> Answer:
     from zlocus.evaluation.comparison import Comparison
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import link_all
+    from zlocus.products.metadata import METADATA
     from zlocus.products.report.page import write_report
 
     comparison = None if options.reference is None else Comparison(options.reference, **arguments)
     with console.progress.stage("Report" if comparison is None else "Comparing, and making the report"):
         path = write_report(options.out, comparison)
     link_all(options.out, console.progress)
-    update_finished(options.out, (path.name, ITEM))
+    update_finished(options.out, (path.name, ITEM, METADATA))
     return Answer(f"{path}: open it in a browser.", {"report": str(path)})
 
 

@@ -1,4 +1,4 @@
-"""Read polygons from vector files: GeoPackage, GeoJSON, Shapefile and others that hold them in the file itself."""
+"""Read polygons and lines from vector files: GeoPackage, GeoJSON, Shapefile and others that hold them themselves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ MAX_LONGITUDE, MAX_LATITUDE = 360.0, 90.0
 MAX_REASON_CHARACTERS = 300  # of the text of another library in a message
 # What GDAL says, before advice about its drivers, of a file that is none of its formats.
 UNKNOWN_FORMAT = "not recognized as being in a supported file format"
-# Vector formats that hold their polygons in the file itself.
+# Kinds of features: the types of shapely, with those of several parts.
+POLYGONS, LINES = (3, 6), (1, 5)
+# Vector formats that hold their features in the file itself.
 VECTOR_DRIVERS = (
     "ESRI Shapefile", "FlatGeobuf", "GeoJSON", "GeoJSONSeq", "GML", "GPKG", "KML", "LIBKML", "MapInfo File",
     "OpenFileGDB", "SQLite", "TopoJSON",
@@ -55,6 +57,55 @@ def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None
         The file is no vector file, refers to other files, is an archive, has several layers, or holds anything but
         polygons; or its polygons have no such attribute.
     """
+    found = _read(path, "polygons", field, force_2d=True)
+    if not len(found.features) and not may_be_empty:
+        raise InputError(f"{path} holds no polygons. Give a file with polygons.")
+    if not np.isin(shapely.get_type_id(found.features), POLYGONS).all():
+        raise InputError(f"{path} holds {found.kind} features, not polygons. Give polygons.")
+    return VectorPolygons(found.features, found.crs, found.numbers, found.values)
+
+
+@dataclass(frozen=True, eq=False)
+class VectorLines:
+    """The lines (n,) of a vector file, shapely, none empty; those with heights have a third coordinate.
+
+    crs : as the file writes it, None without one; numbers : (n,) int64, place of each in the file, from 1.
+    """
+
+    lines: NDArray[np.object_]
+    crs: str | None
+    numbers: NDArray[np.int64]
+
+
+def read_lines(path: Path) -> VectorLines:
+    """Read the lines of a vector file with one layer, with the heights of those that have some.
+
+    Raises
+    ------
+    InputError
+        See `read_vector`; or the file holds anything but lines, or none.
+    """
+    found = _read(path, "lines", None, force_2d=False)
+    if not len(found.features):
+        raise InputError(f"{path} holds no lines. Give a file with lines.")
+    if not np.isin(shapely.get_type_id(found.features), LINES).all():
+        raise InputError(f"{path} holds {found.kind} features, not lines. Give lines.")
+    return VectorLines(found.features, found.crs, found.numbers)
+
+
+@dataclass(frozen=True, eq=False)
+class _Features:
+    """Features (n,) of a vector file that are not empty. kind : of the geometries, as the file names it."""
+
+    features: NDArray[np.object_]
+    kind: str
+    crs: str | None
+    numbers: NDArray[np.int64]
+    values: NDArray[Any] | None
+
+
+def _read(path: Path, what: str, field: str | None, force_2d: bool) -> _Features:
+    """The features of a vector file with one layer. what : kind that is wanted, for messages."""
     # Imported here, because it takes 0.1 to 0.3 s and only runs with polygons need it.
     import pyogrio.raw
 
@@ -66,7 +117,7 @@ def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None
         layers = pyogrio.list_layers(path)[:, 0]
         if len(layers) != 1:
             raise InputError(
-                f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of polygons."
+                f"{path} has {len(layers)} layers ({', '.join(layers)}). Give a file with one layer of {what}."
             )
         if (kind := (info := pyogrio.read_info(path))["driver"]) not in VECTOR_DRIVERS:
             raise InputError(f"{path} is no vector file that is read ({kind}). Give GeoJSON, GeoPackage or Shapefile.")
@@ -74,19 +125,16 @@ def read_vector(path: Path, may_be_empty: bool = False, field: str | None = None
         with warnings.catch_warnings():
             # The library warns of open rings and numbers that are not finite. Callers refuse both.
             warnings.simplefilter("ignore", RuntimeWarning)
-            meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=True)
-            polygons = shapely.from_wkb(wkb)
+            meta, _, wkb, columns = pyogrio.raw.read(path, columns=[] if field is None else [field], force_2d=force_2d)
+            features = shapely.from_wkb(wkb)
     except (RuntimeError, ValueError, shapely.errors.GEOSException) as error:  # includes pyogrio's own
         raise InputError(
             f"{path} cannot be read as vector file: {_reason_of(error)}. Give GeoJSON, GeoPackage or Shapefile."
         ) from error
-    is_there = ~shapely.is_empty(polygons) & ~shapely.is_missing(polygons)
-    polygons, numbers = polygons[is_there], np.flatnonzero(is_there) + 1
-    if not len(polygons) and not may_be_empty:
-        raise InputError(f"{path} holds no polygons. Give a file with polygons.")
-    if not np.isin(shapely.get_type_id(polygons), (3, 6)).all():
-        raise InputError(f"{path} holds {meta['geometry_type']} features, not polygons. Give polygons.")
-    return VectorPolygons(polygons, meta["crs"], numbers, None if field is None else np.asarray(columns[0])[is_there])
+    is_there = ~shapely.is_empty(features) & ~shapely.is_missing(features)
+    numbers = np.flatnonzero(is_there) + 1
+    values = None if field is None else np.asarray(columns[0])[is_there]
+    return _Features(features[is_there], str(meta["geometry_type"]), meta["crs"], numbers, values)
 
 
 def _reason_of(error: Exception) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
+from zlocus.core.break_lines import BreakLines
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.footprints import footprint, ground_box, ground_sample_distance, shared_ground
 from zlocus.core.grid import CellWindow, cells_of_bounds, window_transform
@@ -51,7 +52,8 @@ class MatchScene:
     at the coarsest level, NaN where the terrain model has no height; None without one; trusted_ties : (k, 3) those of
     the ties that neighbours confirm; expected_range : lowest and highest height at which they suggest a surface, None
     where they suggest nothing; line_shift_steps : root mean square displacement of the lines of the images that ties
-    showed and that was put right, as a height: what they do not show is as large.
+    showed and that was put right, as a height: what they do not show is as large; break_lines : given by an operator,
+    None for none.
 
     Lengths and heights are metres on the ground. In image space (`zlocus.matching.image_space`) the ground is a
     reference image: lengths are its pixels, and heights are hypotheses along its rays. That is why these names have no
@@ -72,6 +74,7 @@ class MatchScene:
     trusted_ties: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)), repr=False)
     expected_range: tuple[float, float] | None = None
     line_shift_steps: float = 0.0
+    break_lines: BreakLines | None = None
 
     @property
     def z_range(self) -> tuple[float, float]:

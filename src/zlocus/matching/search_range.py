@@ -79,8 +79,10 @@ def candidates(coarser_result: LevelResult, options: PyramidOptions) -> NDArray[
 
 
 def _widen_to_ties(match_scene: MatchScene, level: PyramidLevel, low: FloatGrid, high: FloatGrid) -> None:
-    """Widen the search ranges of cells to the tie points in them; changes `low` and `high`."""
+    """Widen the search ranges of cells to the tie points and break lines in them; changes `low` and `high`."""
     ties, window = match_scene.ties, level.window
+    if match_scene.break_lines is not None:
+        ties = np.concatenate([ties, match_scene.break_lines.held])
     if not len(ties):
         return
     side = match_scene.cell_size * 2**level.number

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
+from zlocus.matching.break_lines import constrain
 from zlocus.matching.cost_volume import CountedPairs, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
 from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
@@ -407,9 +408,12 @@ def semiglobal_heights(
 
     Where a surface was known before, the constraint is applied a second time. Heights that stand in free rays of sight
     are more expensive then. n_images : that cells are matched with; is_evidence : whether jumps are cheaper the second
-    time where the surface of the first contradicts the images, see `zlocus.matching.prior_costs`.
+    time where the surface of the first contradicts the images, see `zlocus.matching.prior_costs`. Break lines hold both
+    times.
     """
     options, step_cells = tile.config.semiglobal, tile.match_scene.step_cells
+    lines = tile.match_scene.break_lines
+    penalties = constrain(lines, level, search.lattice, search.slope_surface, cost, penalties)
     heights = aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
     if search.smooth is None:
         return heights
@@ -422,6 +426,7 @@ def semiglobal_heights(
         add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number, step_cells)
     elif not has_rays:
         return heights
+    penalties = constrain(lines, level, search.lattice, search.slope_surface, cost, penalties)
     return aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
 
 

@@ -69,7 +69,9 @@ def digest_of(match_scene: MatchScene, orientation: Orientation) -> str:
         "grey": [[scale.mean, scale.contrast, str(scale.trend)] for scale in match_scene.grey_scales],
     }
     digest = hashlib.sha256(json.dumps(setup, sort_keys=True).encode())
-    for array in (match_scene.ties, match_scene.dem_limits, match_scene.trusted_ties):
+    lines = match_scene.break_lines
+    of_lines = () if lines is None else (lines.jumps, lines.held)
+    for array in (match_scene.ties, match_scene.dem_limits, match_scene.trusted_ties, *of_lines):
         if array is not None:
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

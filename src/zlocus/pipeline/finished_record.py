@@ -31,17 +31,21 @@ class Finished:
     """The record of a finished run.
 
     key : all that it depends on, by name, empty where the file is damaged; checksums : of each of its products, by the
-    name of the file; shortcoming : why it is no success unless that is accepted, "" where it is one.
+    name of the file; shortcoming : why it is no success unless that is accepted, "" where it is one; n_redone : how
+    often a part of it was redone since.
     """
 
     key: dict[str, Any]
     checksums: dict[str, str]
     shortcoming: str = ""
+    n_redone: int = 0
 
 
-def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "", names: Iterable[str] = CHECKED) -> None:
-    """Say that the run in a folder is finished, with the checksums of all products that are there. key, shortcoming :
-    see `Finished`; names : of the products, by default those of a surface.
+def write_finished(
+    out: Path, key: Mapping[str, Any], shortcoming: str = "", names: Iterable[str] = CHECKED, n_redone: int = 0
+) -> None:
+    """Say that the run in a folder is finished, with the checksums of all products that are there. key, shortcoming,
+    n_redone : see `Finished`; names : of the products, by default those of a surface.
 
     Raises
     ------
@@ -49,7 +53,7 @@ def write_finished(out: Path, key: Mapping[str, Any], shortcoming: str = "", nam
         Where the file cannot be written.
     """
     checksums = {name: checksum(out / name) for name in names if (out / name).is_file()}
-    _write(out, Finished(dict(key), checksums, shortcoming))
+    _write(out, Finished(dict(key), checksums, shortcoming, n_redone))
 
 
 def read_finished(out: Path) -> Finished | None:
@@ -71,7 +75,8 @@ def read_finished(out: Path) -> Finished | None:
         for name, digest in checksums.items()
         if name in (*CHECKED, *OF_CLOUD) or is_map_of_image(name)
     }
-    return Finished(key, known, str(found.get("shortcoming", "")))
+    n_redone = found.get("redone", 0)
+    return Finished(key, known, str(found.get("shortcoming", "")), n_redone if isinstance(n_redone, int) else 0)
 
 
 def is_map_of_image(name: str) -> bool:
@@ -128,4 +133,5 @@ def _checksum_of_layers(path: Path) -> str:
 
 def _write(out: Path, finished: Finished) -> None:
     record = {"key": finished.key, "products": finished.checksums, "shortcoming": finished.shortcoming}
-    write_record(out / FINISHED, {"schema": SCHEMA, **record})
+    redone = {"redone": finished.n_redone} if finished.n_redone else {}
+    write_record(out / FINISHED, {"schema": SCHEMA, **record, **redone})

@@ -17,6 +17,7 @@ from zlocus.pipeline.fingerprint import digest_of
 from zlocus.pipeline.finished_record import ITEM, Finished, checksum, comparable, read_finished, update_finished
 from zlocus.pipeline.setup import OpenedInputs, orient_views, set_up_run
 from zlocus.products.derived import FILES, link_all, write_derived
+from zlocus.products.metadata import METADATA
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.tie_layers import write_ties
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
@@ -33,7 +34,7 @@ class Missing:
     """Products of a finished run that are missing.
 
     matched : names of the files that only matching makes; of_ties : of those that the tie points make; maps : of maps,
-    as --products has them; report, item : whether that is missing.
+    as --products has them; report : whether that is missing; item : whether the item or the metadata are.
     """
 
     matched: tuple[str, ...]
@@ -98,7 +99,7 @@ def missing_products(request: DsmRequest, finished: Finished, progress: Progress
         of_ties=tuple(name for name in OF_TIES if name in gone),
         maps=tuple(name for name in FILES if name in request.products and not (out / FILES[name]).is_file()),
         report=REPORT in gone,
-        item=ITEM in gone,
+        item=bool({ITEM, METADATA} & gone),
     )
 
 
@@ -131,7 +132,18 @@ def whole_again(request: DsmRequest, finished: Finished, missing: Missing, progr
     """The request of a run that is repeated because products are missing that only matching makes.
 
     It includes the maps and the report that were added to the finished run later.
+
+    Raises
+    ------
+    OutputError
+        Parts of the run were redone, which the same command does not repeat.
     """
+    if finished.n_redone:
+        raise OutputError(
+            f"The finished run in {request.out} lacks {', '.join(missing.matched)}, which only matching makes, and "
+            "parts of it were redone since (--redo), which this command would not repeat. Put the missing files back, "
+            "or add --overwrite (in Python: overwrite=True) to make the whole run anew, without these parts."
+        )
     progress.note(
         f"The finished run in {request.out} lacks {', '.join(missing.matched)}, which only matching makes: it is made "
         "again."
@@ -170,7 +182,7 @@ def make_missing(
         if missing.item or set(missing.files) - set(finished.checksums):
             link_all(out, progress)
     finally:
-        update_finished(out, (*missing.files, ITEM))
+        update_finished(out, (*missing.files, ITEM, METADATA))
     made = [name for name in missing.files if (out / name).is_file()]
     if made:
         progress.note(f"Made, for it was not there: {', '.join(made)}.")

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from zlocus.core.errors import CoverageError, InputError
 from zlocus.core.progress import Progress, SilentProgress
+from zlocus.core.quoting import counted
 from zlocus.core.request_checks import is_scene_file
 from zlocus.core.requests import CloudRequest, DsmRequest, SetupRequest, check_output
 from zlocus.core.rerun_request import RerunRequest
@@ -75,6 +76,12 @@ def run_again(request: RerunRequest, progress: Progress) -> RerunResult:
     path = request.record / RECORD if request.record.is_dir() else request.record
     run = read_record(path)
     kind = kind_of(path, run)
+    if n_redone := len(run.get("redone", [])):
+        raise InputError(
+            f"{path} is of a surface of which {counted(n_redone, 'part')} {'was' if n_redone == 1 else 'were'} redone, "
+            "and a rerun repeats one run. Make the surface with `zlocus dsm` and the options in run.json, and repeat "
+            "each --redo of its history."
+        )
     check_output(request.out, request.overwrite, may_be_same=True)
     with progress.stage("Checking inputs"):
         again, config = recorded_request(request, path, run, kind), config_of(path, run)

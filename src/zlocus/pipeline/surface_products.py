@@ -39,6 +39,7 @@ from zlocus.products.derived import link_all, write_derived
 from zlocus.products.ortho_colours import colour_records
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES, RECORD
+from zlocus.products.surface_statistics import surface_statistics
 from zlocus.products.tie_layers import write_ranking, write_ties
 from zlocus.products.tie_observations import write_observations
 
@@ -147,6 +148,7 @@ def run_record(
         "heights": heights_record(setup),
         **tally.as_dict(),
         "plan": plan.as_dict(),
+        **surface_statistics(request.out).as_dict(),
         "rasters": {name: checksum(request.out / name) for name in RASTERS},
     }
 

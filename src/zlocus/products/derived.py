@@ -12,6 +12,7 @@ from zlocus.core.progress import Progress
 from zlocus.products.contours import write_contours
 from zlocus.products.dtm import write_dtm
 from zlocus.products.hillshade import write_hillshade
+from zlocus.products.metadata import METADATA, write_metadata
 from zlocus.products.stac_item import write_item
 
 # Files by the names of --products, in the order in which they are made: contours may need the terrain.
@@ -45,13 +46,14 @@ def write_derived(folder: Path, names: Collection[str], options: ProductOptions,
 
 
 def link_all(folder: Path, progress: Progress) -> None:
-    """Write the item that links all files of a folder, or note why there is none.
+    """Write the metadata of a surface, and the item that links all files of its folder, or note why there is none.
 
     Raises
     ------
     InputError, OutputError
-        See `write_item`.
+        See `write_metadata` and `write_item`.
     """
+    write_metadata(folder)
     if not write_item(folder):
         progress.note("No item.json: the frame is local, and STAC is about places on the Earth.")
 
@@ -79,7 +81,7 @@ def remove_derived(folder: Path) -> None:
     OutputError
         A file cannot be removed.
     """
-    for name in (*FILES.values(), "item.json", "ranking.gpkg"):
+    for name in (*FILES.values(), METADATA, "item.json", "ranking.gpkg"):
         try:
             with suppress(FileNotFoundError):
                 (folder / name).unlink()

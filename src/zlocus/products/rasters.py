@@ -17,6 +17,7 @@ from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.matching.surface import Surface
+from zlocus.products.surface_cells import SurfaceCells
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 
@@ -78,16 +79,33 @@ class SurfaceRasters:
 
     def write(self, row: int, col: int, surface: Surface) -> None:
         """Write a block of cells whose first cell is (row, col) of the grid."""
-        self._dsm.write(row, col, self._vertical.heights_from_ellipsoidal(surface.height, self._geobox, row, col))
-        self._sigma.write(row, col, surface.sigma)
-        self._quality.write(row, col, surface.quality)
-        self._views.write(row, col, surface.views)
+        cells = self.cells_of(row, col, surface)
+        self._dsm.write(row, col, cells.height)
+        self._sigma.write(row, col, cells.sigma)
+        self._quality.write(row, col, cells.quality)
+        self._views.write(row, col, cells.views)
+        self._ortho.write(row, col, cells.ortho, cells.has_grey)
+
+    def cells_of(self, row: int, col: int, surface: Surface) -> SurfaceCells:
+        """What `write` writes of a block of cells whose first cell is (row, col) of the grid; no water is known."""
+        height = self._vertical.heights_from_ellipsoidal(surface.height, self._geobox, row, col)
         bands = np.moveaxis(np.atleast_3d(surface.ortho), -1, 0)
+        if len(bands) > len(self._bands):
+            bands = bands.mean(axis=0, keepdims=True)
         valid = np.asarray(np.isfinite(bands).all(axis=0))
         shape = (len(self._bands), *valid.shape)
-        self._ortho.write(
-            row, col, as_source(np.broadcast_to(np.where(valid, bands, 0), shape), self._ortho_dtype), valid
-        )
+        ortho = as_source(np.broadcast_to(np.where(valid, bands, 0), shape), self._ortho_dtype)
+        none = np.full(valid.shape, WaterKind.LAND, np.uint8)
+        return SurfaceCells(height, surface.sigma, surface.quality, surface.views, ortho, valid, none)
+
+    def write_cells(self, row: int, col: int, cells: SurfaceCells) -> None:
+        """Write cells as they are, with their water, from (row, col) of the grid on."""
+        self._dsm.write(row, col, cells.height)
+        self._sigma.write(row, col, cells.sigma)
+        self._quality.write(row, col, cells.quality)
+        self._views.write(row, col, cells.views)
+        self._ortho.write(row, col, cells.ortho, cells.has_grey)
+        self._water.write(row, col, cells.water)
 
     def heights(self, row: int, col: int, shape: tuple[int, int]) -> WrittenHeights:
         """Heights of cells that are written, whose first is (row, col) of the grid. shape : rows and columns."""

@@ -61,6 +61,7 @@ PRODUCTS = (
     Product("footprints.geojson", "Footprints and overlaps of the images", GEOJSON, ("metadata",)),
     Product("curves.json", "Match curves of some cells", JSON, ("metadata",)),
     Product("events.jsonl", "Events of the run with their times", "application/x-ndjson", ("metadata",)),
+    Product("metadata.xml", "Lineage and quality by ISO 19115 and ISO 19157", "application/xml", ("metadata",)),
     Product("run.json", "Request, options, versions, inputs and times of the run", JSON, ("metadata",)),
 )
 
