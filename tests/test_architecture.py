@@ -125,6 +125,8 @@ def test_no_module_reaches_for_the_network(module):
     addresses = re.findall(r"https?://[^\s\"'>)]+", module.read_text(encoding="utf-8"))
     # The address of the inspector's own page is put together from host and port; that of SVG is the format's name.
     own = r"http://\{\w+" if listens else "http://www.w3.org/2000/svg$"
+    if module.relative_to(SOURCE).as_posix() == "io/iso_xml.py":  # which is about the names of that format
+        own = r"https?://(standards\.iso\.org|schemas\.isotc211\.org|www\.opengis\.net|www\.w3\.org)/"
     assert [each for each in addresses if not re.match(own, each)] == []
 
 

@@ -255,7 +255,7 @@ def redo(options: DsmOptions, request: DsmRequest, console: Console) -> Answer:
     # Not given: the method of the run, and not the usual one.
     asked = request if options.method is not None else replace(request, method=DsmRequest.method)
     part = RedoRequest(
-        surface=asked, area=options.redo, margin_m=options.redo_margin, break_lines=options.break_lines,
+        dsm_request=asked, area=options.redo, margin_m=options.redo_margin, break_lines=options.break_lines,
         level=options.level, config=options.config, settings=tuple(options.settings or ()),
     )  # fmt: skip
     from zlocus.pipeline.redo import run_redo

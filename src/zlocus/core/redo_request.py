@@ -15,7 +15,7 @@ from zlocus.core.requests import DsmRequest
 class RedoRequest:
     """A part of a finished surface to be made again. `None` means: not given.
 
-    surface : inputs, folder of the finished run, and the options that are to differ from those of the run; area :
+    dsm_request : inputs, folder of the finished run, and the options that are to differ from those of the run; area :
     polygons of the part; margin_m : width of the ramp inside their borders on which old and new heights are blended;
     break_lines : lines with heights that the surface has there, and without heights across which it may jump; level :
     the height of all cells inside, m in the vertical datum of the surface, or the attribute of the polygons that holds
@@ -27,7 +27,7 @@ class RedoRequest:
         A value out of range, or two that exclude each other.
     """
 
-    surface: DsmRequest
+    dsm_request: DsmRequest
     area: Path
     margin_m: float | None = None
     break_lines: Path | None = None
@@ -43,7 +43,7 @@ class RedoRequest:
                 f"--level {self.level} fixes all heights, and --break-lines {self.break_lines} has no effect then. "
                 "Leave one out."
             )
-        if self.surface.overwrite:
+        if self.dsm_request.overwrite:
             raise ConfigError(
                 "--redo changes a part of a finished run, and --overwrite makes all of it anew. Leave one out."
             )

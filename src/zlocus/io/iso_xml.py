@@ -19,6 +19,8 @@ NAMESPACES = {
 }
 CODE_LISTS = "https://schemas.isotc211.org/19115/resources/Codelist/cat/codelists.xml"
 SCHEMA_LOCATION = f"{NAMESPACES['mdb']} https://schemas.isotc211.org/19115/-3/mds/2.0/mds.xsd"
+# Units of figures: metres and pixels.
+UNITS = {"m": "http://www.opengis.net/def/uom/UCUM/m", "px": "http://www.opengis.net/def/uom/UCUM/%7Bpixel%7D"}
 # Characters that XML 1.0 cannot hold.
 NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

@@ -38,7 +38,7 @@ def redo_request(request: RedoRequest, run: Mapping[str, Any]) -> DsmRequest:
     ConfigError
         An option differs that has to be that of the run, or the part would be matched in image space.
     """
-    given, recorded = request.surface, request_of(request.surface.out / RECORD, run)
+    given, recorded = request.dsm_request, request_of(request.dsm_request.out / RECORD, run)
     of_run = {name: getattr(recorded, name) for name in (*OF_GRID, *OF_WATER)}
     for name in (*OF_GRID, *OF_WATER):
         if _is_given(given, name) and not _same(getattr(given, name), of_run[name]):
@@ -81,11 +81,11 @@ def redo_config(request: RedoRequest, run: Mapping[str, Any]) -> RunConfig:
     ConfigError
         An option is not known, or one of the cameras, of water or of products differs from that of the run.
     """
-    of_run = config_as_dict(config_of(request.surface.out / RECORD, run))
+    of_run = config_as_dict(config_of(request.dsm_request.out / RECORD, run))
     values = dict(of_run) if request.config is None else values_of_file(request.config)
     config = with_settings(
         {group: dict(options) if isinstance(options, dict) else options for group, options in values.items()},
-        str(request.config or request.surface.out / RECORD), request.settings,
+        str(request.config or request.dsm_request.out / RECORD), request.settings,
     )  # fmt: skip
     if request.config is not None:  # which says nothing of these groups, unless it names them
         kept = {group: of_run[group] for group in KEPT_GROUPS if group not in values}
@@ -95,7 +95,7 @@ def redo_config(request: RedoRequest, run: Mapping[str, Any]) -> RunConfig:
         for name, value in now[group].items():
             if value != of_run[group].get(name):
                 raise ConfigError(
-                    f"{group}.{name} = {value} is not that of the run in {request.surface.out} "
+                    f"{group}.{name} = {value} is not that of the run in {request.dsm_request.out} "
                     f"({of_run[group].get(name)}), which --redo keeps. Leave it out."
                 )
     return config

@@ -17,7 +17,7 @@ from pyproj import CRS
 from zlocus.core.requests import DEMO_ACCURACY, EVALUATION_FILES
 from zlocus.core.scene import is_local
 from zlocus.io.atomic_write import write_atomically
-from zlocus.io.iso_xml import citation, code, document, element, identifier, instant, number, text, typed_date
+from zlocus.io.iso_xml import UNITS, citation, code, document, element, identifier, instant, number, text, typed_date
 from zlocus.io.open_raster import open_raster
 from zlocus.io.run_record import read_record
 from zlocus.products.stac_item import footprint_of
@@ -80,6 +80,8 @@ def write_metadata(folder: Path) -> bool:
     with open_raster(folder / "dsm.tif", "raster") as file:
         bbox = None if is_local(CRS.from_user_input(run["grid"]["crs"])) else footprint_of(file).bbox
     content = document(_metadata(run, bbox, _evaluation(folder, run)))
+    if (folder / METADATA).is_file() and (folder / METADATA).read_bytes() == content:
+        return True
     write_atomically(folder / METADATA, lambda part: part.write_bytes(content))
     return True
 
@@ -290,9 +292,6 @@ def _reported(kind: str, figure: Figure, method: str) -> Element:
         f"mdq:{kind}", element("mdq:measure", measure), element("mdq:evaluationMethod", evaluated),
         element("mdq:result", result),
     )  # fmt: skip
-
-
-UNITS = {"m": "http://www.opengis.net/def/uom/UCUM/m", "px": "http://www.opengis.net/def/uom/UCUM/%7Bpixel%7D"}
 
 
 def _lineage(run: Mapping[str, Any]) -> Element:
