@@ -94,8 +94,11 @@ class RedoFolder:
         self.remove()
 
     def remove(self) -> None:
-        """Remove everything beside the surface."""
-        shutil.rmtree(self.work, ignore_errors=True)
+        """Remove everything beside the surface, after one that an exchange left there was put back."""
+        with suppress(OSError):
+            restored_folder(self.out, self.surface)
+        if self.out.exists():
+            shutil.rmtree(self.work, ignore_errors=True)
 
 
 def _link(file: Path, name: Path) -> None:
