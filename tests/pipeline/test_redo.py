@@ -210,9 +210,10 @@ def stopped(*_):
 
 def test_an_interrupted_part_leaves_the_surface_and_resumes(surface, square, monkeypatch):
     area, before = square("area.geojson", 0.2, 0.2, 0.5), state(surface)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(RedoFolder, "replace", stopped)
-        redo(surface, area, settings=OTHER)
+        with pytest.raises(KeyboardInterrupt):
+            redo(surface, area, settings=OTHER)
     assert state(surface) == before
     progress = KeptNotes()
     result = redo(surface, area, progress, settings=OTHER)
@@ -225,9 +226,10 @@ def test_an_interrupted_part_leaves_the_surface_and_resumes(surface, square, mon
 
 def test_tiles_of_a_part_with_other_options_are_dropped(surface, square, monkeypatch):
     area = square("area.geojson", 0.2, 0.2, 0.5)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(RedoFolder, "replace", stopped)
-        redo(surface, area, settings=OTHER)
+        with pytest.raises(KeyboardInterrupt):
+            redo(surface, area, settings=OTHER)
     progress = KeptNotes()
     redo(surface, area, progress)
     assert any("dropped" in note for note in progress.sentences)
@@ -302,7 +304,7 @@ def test_what_cannot_be_redone_is_refused_and_changes_nothing(surface, square, g
 
 
 def test_a_polygon_without_a_level_is_named(surface, square):
-    with pytest.raises(InputError, match="Polygon 1 of .* has no level in height"):
+    with pytest.raises(InputError, match=r"Polygon 1 of .* has no level in height"):
         redo(surface, square("area.geojson", 0.2, 0.2, 0.2, height=None), level="height")
 
 
@@ -320,7 +322,7 @@ def test_heights_of_lines_that_are_not_searched_are_refused(surface, square, tmp
     lines = vector(
         tmp_path / "lines.geojson", [("LineString", [[box.left, box.bottom, 9000], [box.right, box.top, 9000]], {})]
     )
-    with pytest.raises(InputError, match="has heights from 9000.00 to 9000.00 m outside"):
+    with pytest.raises(InputError, match=r"has heights from 9000.00 to 9000.00 m outside"):
         redo(surface, square("area.geojson", 0.2, 0.2, 0.5), break_lines=lines)
 
 
@@ -348,7 +350,7 @@ def test_the_command_of_the_run_finds_a_redone_surface_finished_and_never_drops_
     (surface / "sigma.tif").unlink()
     with pytest.raises(OutputError, match="parts of it were redone since"):
         run_dsm(request, config, KeptNotes())
-    with pytest.raises(OutputError, match="lacks sigma.tif"):
+    with pytest.raises(OutputError, match=r"lacks sigma.tif"):
         redo(surface, square("area.geojson", 0.3, 0.3, 0.2), level="451")
 
 
