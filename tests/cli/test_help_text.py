@@ -19,7 +19,8 @@ def test_the_help_of_dsm_shows_options_in_groups_and_examples():
     lines = shown.splitlines()
     headings = [line[:-1] for line in lines if line and line[0] != " " and line.endswith(":")]
     assert headings == [
-        "Arguments", "Result", "Area and grid", "Heights", "Matching", "Run", "Messages", "Examples",
+        "Arguments", "Result", "Area and grid", "Heights", "Matching", "Run", "A part of a finished run", "Messages",
+        "Examples",
     ]  # fmt: skip
     matching = shown[shown.index("Matching:") : shown.index("Run:")]
     assert "--method" in matching

@@ -170,7 +170,7 @@ def run(step: Step, folder: Path) -> None:
     command = [sys.executable, "-c", step.text] if step.is_python else ["bash", "-c", runnable(step.text)]
     words = [] if step.is_python else shlex.split(runnable(step.text))
     out = folder / words[words.index("-o") + 1] if "-o" in words else folder / "scene.yaml"
-    if words[:2] == ["zlocus", "import"] or "-o" in words:
+    if words[:2] == ["zlocus", "import"] or ("-o" in words and "--redo" not in words):
         shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
     if words[:2] == ["zlocus", "inspect"]:
         check_page(words, folder, environment)

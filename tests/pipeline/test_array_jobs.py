@@ -32,7 +32,7 @@ from zlocus.pipeline.execution.checkpoint import FOLDER
 from zlocus.pipeline.finished_record import checksum
 
 # Files that say when they were made, or how long it took.
-WITH_TIMES = {"run.json", "item.json", "report.html", "events.jsonl", "finished.json"}
+WITH_TIMES = {"run.json", "item.json", "metadata.xml", "report.html", "events.jsonl", "finished.json"}
 N_TASKS = 3
 
 

@@ -140,7 +140,7 @@ def test_products(whole, images):
         assert valid, (problems, warnings)
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
-    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json", "item.json",
+    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json", "item.json", "metadata.xml",
             "events.jsonl", "finished.json", *REPORT_FILES}  # fmt: skip
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
@@ -245,6 +245,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
         "observations.npz",
         "run.json",
         "item.json",
+        "metadata.xml",
         "events.jsonl",
         "finished.json",
     }

@@ -15,6 +15,7 @@ import rasterio
 import shapely
 import typer.main
 from pyproj import Transformer
+from pyogrio.raw import write as write_vector
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 
@@ -298,6 +299,16 @@ def lay_out_lakes(folder: Path) -> None:
     write_water(folder / "lakes.gpkg", lakes, LEVEL=[1.75, None])
 
 
+def lay_out_parts(folder: Path) -> None:
+    """Three images, polygons of parts of their surface, and a break line."""
+    lay_out_images(folder)
+    x, y = CENTRE
+    for name, west in (("roof", -10), ("quay", -3), ("basin", 3)):
+        write_water(folder / f"{name}.gpkg", [shapely.box(x + west, y - 8, x + west + 6, y + 6)])
+    edge = np.array([shapely.LineString([(x - 0.2, y - 9), (x, y + 9)])], object)
+    write_vector(folder / "edges.gpkg", shapely.to_wkb(edge), [], [], geometry_type="LineString", crs="EPSG:32632")
+
+
 def lay_out_masked(folder: Path) -> None:
     """A scene file of three images, one with a mask over its right half."""
     lay_out_images(folder)
@@ -340,6 +351,7 @@ LAID_OUT = {
     "docs/how-to/masks.md": lay_out_masked,
     "docs/how-to/mosaic.md": lay_out_strips,
     "docs/how-to/orient.md": lay_out_images,
+    "docs/how-to/redo.md": lay_out_parts,
     "docs/how-to/report.md": lay_out_comparison,
     "docs/how-to/vertical.md": lay_out_datums,
     "docs/how-to/water.md": lay_out_lakes,
