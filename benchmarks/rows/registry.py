@@ -51,6 +51,7 @@ ROWS: dict[str, Row] = {
     "align": Row("rows.alignment:align", WITH_RENDERER),
     "mosaic": Row("rows.joined:mosaic", WITH_RENDERER, is_slow=True),
     "change": Row("rows.joined:change", WITH_RENDERER, is_slow=True),
+    "redo": Row("rows.redo:redo", WITH_RENDERER),
     "precision": Row("rows.standard_deviations:precision", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     "flags": Row("rows.flags:flags", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     # How hard the recipe is for other programs: from benchmarks/peers/results.json.

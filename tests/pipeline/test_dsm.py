@@ -140,8 +140,10 @@ def test_products(whole, images):
         assert valid, (problems, warnings)
         with rasterio.open(whole / name) as file:
             assert "STATISTICS_MEAN" in file.tags(1)
-    made = {*PRODUCTS, *MAPS, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json", "item.json", "metadata.xml",
-            "events.jsonl", "finished.json", *REPORT_FILES}  # fmt: skip
+    made = {
+        *PRODUCTS, *MAPS, *REPORT_FILES, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json",
+        "item.json", "metadata.xml", "events.jsonl", "finished.json",
+    }  # fmt: skip
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
