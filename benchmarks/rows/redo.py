@@ -47,6 +47,8 @@ def redo(workplace: Workplace) -> list[Figure]:
             "the same options": [], "other options": [*OTHER_OPTIONS], "outlines of roofs": ["--break-lines", roofs],
             "a level": ["--level", level_of(base)],
         }  # fmt: skip
+        if not near_outlines(base, scene, area).any():  # no roof stands there
+            del ways["outlines of roofs"]
         for way, options in ways.items():
             out = workplace.out / f"town{seed}-redone"
             shutil.rmtree(out, ignore_errors=True)
@@ -90,7 +92,7 @@ def write_area(surface: Path, seed: int) -> Path:
     with rasterio.open(surface / "dsm.tif") as file:
         west, south, east, north = file.bounds
     rng = np.random.default_rng(seed)
-    angles, radius = np.sort(rng.uniform(0, 2 * np.pi, 9)), min(east - west, north - south) * rng.uniform(0.2, 0.4, 9)
+    angles, radius = np.sort(rng.uniform(0, 2 * np.pi, 9)), min(east - west, north - south) * rng.uniform(0.3, 0.45, 9)
     centre = np.array([(west + east) / 2, (south + north) / 2])
     corners = centre + radius[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     path = surface.with_name(f"{surface.name}-area.gpkg")
@@ -148,12 +150,18 @@ def right_near_outlines(surface: Path, scene: Path, area: Path) -> float:
         known = (true_col >= 0) & (true_row >= 0) & (true_col < truth.width) & (true_row < truth.height)
         true = np.full(heights.shape, np.nan)
         true[known] = truth.read(1)[true_row[known], true_col[known]]
+    judged = near_outlines(surface, scene, area) & known
+    return float((np.abs(heights - true)[judged] < RIGHT_M).sum() / judged.sum())
+
+
+def near_outlines(surface: Path, scene: Path, area: Path) -> np.ndarray:
+    """Cells (r, c) of a surface inside an area and near outlines of buildings."""
     from pyogrio.raw import read
 
     lines = shapely.from_wkb(read(scene / "outlines.gpkg")[2])
-    near = rasterize(shapely.buffer(lines, NEAR_M), out_shape=heights.shape, transform=transform, dtype="uint8") > 0
-    judged = near & known & cells_of(area, surface)
-    return float((np.abs(heights - true)[judged] < RIGHT_M).sum() / judged.sum())
+    with rasterio.open(surface / "dsm.tif") as file:
+        near = rasterize(shapely.buffer(lines, NEAR_M), out_shape=file.shape, transform=file.transform, dtype="uint8")
+    return (near > 0) & cells_of(area, surface)
 
 
 def kills(workplace: Workplace, command: list[Any], base: Path, seed: int) -> int:
