@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -364,9 +365,11 @@ def test_files_of_others_in_the_folder_are_kept(surface, square):
     (surface / "mine").mkdir()
     (surface / "mine" / "notes.txt").write_text("mine")
     (surface / "project.qgz").write_text("project")
+    surface.chmod(0o750)
     redo(surface, square("area.geojson", 0.3, 0.3, 0.2), level="450")
     assert (surface / "mine" / "notes.txt").read_text() == "mine"
     assert (surface / "project.qgz").read_text() == "project"
+    assert stat.S_IMODE(surface.stat().st_mode) == 0o750
 
 
 def test_a_working_folder_is_not_replaced(surface, square, monkeypatch):

@@ -62,6 +62,7 @@ class RedoFolder:
         try:
             shutil.rmtree(self.surface, ignore_errors=True)
             self.surface.mkdir(parents=True)
+            shutil.copymode(self.out, self.surface)
             for place, folders, names in os.walk(self.out):
                 to = self.surface / Path(place).relative_to(self.out)
                 if Path(place) == self.out:
@@ -69,6 +70,7 @@ class RedoFolder:
                     names = [name for name in names if name not in remade]
                 for name in [name for name in folders if not (Path(place) / name).is_symlink()]:
                     (to / name).mkdir()
+                    shutil.copymode(Path(place) / name, to / name)
                 for name in names + [name for name in folders if (Path(place) / name).is_symlink()]:
                     _link(Path(place) / name, to / name)
         except OSError as error:
