@@ -193,5 +193,8 @@ def test_elements_stand_in_the_order_of_the_schema(surface):
     names = [each.tag.rpartition("}")[2] for each in tree(surface)]
     assert list(dict.fromkeys(names)) == order
     assert sorted(names, key=order.index) == names
+    (lineage,) = found(tree(surface), "mdb:resourceLineage/mrl:LI_Lineage")
+    parts = list(dict.fromkeys(each.tag.rpartition("}")[2] for each in lineage))
+    assert parts == ["statement", "scope", "source", "processStep"]
     ids = [value for each in tree(surface).iter() for key, value in each.attrib.items() if key.endswith("}id")]
     assert len(set(ids)) == len(ids)

@@ -33,6 +33,8 @@ def same(one, other):
 def test_outside_the_area_nothing_changes():
     old = cells(10.0)
     assert same(blended(old, cells(30.0, quality=64, views=2, grey=9), weights(0)), old)
+    gap = cells(np.nan, np.nan, Quality.NO_MATCH, 0)
+    assert same(blended(gap, cells(30.0), weights(0)), gap)
 
 
 def test_beyond_the_ramp_everything_is_new():
