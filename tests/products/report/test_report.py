@@ -650,6 +650,18 @@ def test_levelled_water_is_counted_as_water_alone(made):
     assert (row.n, row.fate, row.meaning) == (23, "levelled", words.MEANINGS[Quality.WATER])
 
 
+def test_the_summary_tells_parts_that_were_redone():
+    entries = [{"cells_changed": n, "time": f"2026-01-0{n}T10:00:00+00:00"} for n in range(1, 5)]
+    assert words.what_was_redone({}) == ""
+    assert words.what_was_redone({"redone": entries[:1]}) == (
+        "1 part was redone after the run (1 cells on 2026-01-01): times and options on this page are those of the "
+        "run; see run.json."
+    )
+    assert words.what_was_redone({"redone": entries}).startswith(
+        "4 parts were redone after the run (2 cells on 2026-01-02, 3 cells on 2026-01-03, 4 cells on 2026-01-04): "
+    )
+
+
 def test_the_summary_tells_levels_and_possible_water():
     levels = [{"name": f"polygon {k}", "level_m": 400.0 + k, "kind": "levelled"} for k in range(1, 8)]
     said = words.what_is_water({"water": {"levelled": levels, "possible": 2}})

@@ -81,6 +81,8 @@ NONE = "–"
 MIN_SHOWN_SHARE = 0.0001
 # The summary names at most this many water surfaces.
 MAX_NAMED_WATER = 5
+# And at most this many parts that were redone, the last ones.
+MAX_NAMED_PARTS = 3
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,7 @@ def summary(survey: Survey, run: dict[str, Any], crs: CRS, quantiles: dict[int, 
             f"of a height is {size(quantiles[50], 'm')} or better for half of the cells, and "
             f"{size(quantiles[90], 'm')} or better for nine in ten."
         )
-    said += [what_is_missing(survey), what_is_doubtful(survey), what_is_water(run)]
+    said += [what_is_missing(survey), what_is_doubtful(survey), what_is_water(run), what_was_redone(run)]
     return " ".join(sentence for sentence in said if sentence)
 
 
@@ -280,6 +282,20 @@ def what_is_water(run: Mapping[str, Any]) -> str:
         areas = "1 area" if n_kept == 1 else f"{n_kept} areas"
         said.append(f"Water is possible in {areas} (3 in water.tif), where the images agree at no height.")
     return " ".join([*said, *water.get("doubts", [])])
+
+
+def what_was_redone(run: Mapping[str, Any]) -> str:
+    """How many parts were redone after the run, and how many cells changed, in a sentence; "" without any."""
+    redone = run.get("redone", [])
+    if not redone:
+        return ""
+    parts = "1 part was" if len(redone) == 1 else f"{len(redone)} parts were"
+    counts = listed(
+        [f"{each['cells_changed']} cells on {str(each['time'])[:10]}" for each in redone[-MAX_NAMED_PARTS:]]
+    )
+    return (
+        f"{parts} redone after the run ({counts}): times and options on this page are those of the run; see run.json."
+    )
 
 
 def what_is_doubtful(survey: Survey) -> str:
