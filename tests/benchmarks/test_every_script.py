@@ -82,6 +82,7 @@ RUN_BY = {
     "rows/many_images.py": "test_many_images.py::test_false_heights_on_ground_away_from_buildings_are_counted",
     "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/photographs.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/redo.py": "test_redo_row.py::test_changed_cells_and_mixtures_are_noticed",
     "rows/registry.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/real_images.py": "test_real_images.py::test_a_row_judges_a_surface_by_the_image_that_was_left_out",
     "rows/rendered.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",

@@ -37,6 +37,7 @@ def search_range(second_at, margin_at, ties=(), side=3, winner_at=20):
     second[some], margin[some], winner_takes_all[some] = second_at, margin_at, winner_at
     match_scene = SimpleNamespace(
         ties=np.array(ties, float).reshape(-1, 3),
+        break_lines=None,
         cell_size=0.5,
         anchor=(1000.0, 2000.0),
         height_origin=10.0,
