@@ -47,7 +47,7 @@ def redo(workplace: Workplace) -> list[Figure]:
             "the same options": [], "other options": [*OTHER_OPTIONS], "outlines of roofs": ["--break-lines", roofs],
             "a level": ["--level", level_of(base)],
         }  # fmt: skip
-        if not near_outlines(base, scene, area).any():  # no roof stands there
+        if not shapely.intersects(geometries(area)[0], geometries(roofs)).any():  # no roof stands there
             del ways["outlines of roofs"]
         for way, options in ways.items():
             out = workplace.out / f"town{seed}-redone"
@@ -118,11 +118,16 @@ def level_of(surface: Path) -> float:
         return round(float(np.nanmedian(file.read(1))), 2)
 
 
-def cells_of(area: Path, surface: Path) -> np.ndarray:
-    """Cells (r, c) of a surface whose centres lie inside the polygon of a file."""
+def geometries(path: Path) -> np.ndarray:
+    """Geometries (n,) of a vector file."""
     from pyogrio.raw import read
 
-    (polygon,) = shapely.from_wkb(read(area)[2])
+    return np.asarray(shapely.from_wkb(read(path)[2]))
+
+
+def cells_of(area: Path, surface: Path) -> np.ndarray:
+    """Cells (r, c) of a surface whose centres lie inside the polygon of a file."""
+    (polygon,) = geometries(area)
     with rasterio.open(surface / "dsm.tif") as file:
         return rasterize([polygon], out_shape=file.shape, transform=file.transform, dtype="uint8") > 0
 
@@ -156,9 +161,7 @@ def right_near_outlines(surface: Path, scene: Path, area: Path) -> float:
 
 def near_outlines(surface: Path, scene: Path, area: Path) -> np.ndarray:
     """Cells (r, c) of a surface inside an area and near outlines of buildings."""
-    from pyogrio.raw import read
-
-    lines = shapely.from_wkb(read(scene / "outlines.gpkg")[2])
+    lines = geometries(scene / "outlines.gpkg")
     with rasterio.open(surface / "dsm.tif") as file:
         near = rasterize(shapely.buffer(lines, NEAR_M), out_shape=file.shape, transform=file.transform, dtype="uint8")
     return (near > 0) & cells_of(area, surface)
