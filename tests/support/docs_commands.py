@@ -14,8 +14,8 @@ import numpy as np
 import rasterio
 import shapely
 import typer.main
-from pyproj import Transformer
 from pyogrio.raw import write as write_vector
+from pyproj import Transformer
 from rasterio.transform import from_origin
 from scipy.spatial.transform import Rotation
 

@@ -40,8 +40,8 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     from zlocus.io.open_raster import existing_file
     from zlocus.pipeline.finished_record import ITEM, update_finished
     from zlocus.products.derived import FILES, link_all, write_derived
-    from zlocus.products.report.file_names import REPORT
     from zlocus.products.metadata import METADATA
+    from zlocus.products.report.file_names import REPORT
 
     existing_file(options.out / "dsm.tif", "surface")
     if options.config is None:
