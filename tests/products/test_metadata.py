@@ -7,9 +7,13 @@ import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+import rasterio
+from typer.testing import CliRunner
 
 from iso_schemas import faults_of, iso_schema
+from zlocus.cli.app import app
 from zlocus.io.crs import local_frame
 from zlocus.io.iso_xml import NAMESPACES, text
 from zlocus.io.run_record import read_record, write_record
@@ -133,6 +137,26 @@ def test_an_evaluation_in_the_folder_is_the_absolute_accuracy(surface):
         if value is not None
     }
     assert {kind for _, kind in stated.values()} == {"DQ_AbsoluteExternalPositionalAccuracy"}
+
+
+def test_accuracy_at_check_points_is_told_as_soon_as_it_is_known(surface, tmp_path):
+    with rasterio.open(surface / "dsm.tif") as source:
+        z, transform = source.read(1), source.transform
+        crs = source.crs.to_string()
+    rows, cols = np.nonzero(np.isfinite(z[20:-20:5, 20:-20:5]))
+    rows, cols = 20 + 5 * rows, 20 + 5 * cols
+    x, y = transform * (cols + 0.5, rows + 0.5)
+    lines = [f"{a},{b},{c + 0.25}" for a, b, c in zip(x, y, z[rows, cols], strict=True)]
+    (tmp_path / "points.csv").write_text("\n".join(["x,y,z", *lines, ""]))
+    words = ["evaluate", surface / "dsm.tif", tmp_path / "points.csv", "--points-crs", crs, "-o", surface]
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    record, stated = read_record(surface / "evaluation.json"), figures(surface)
+    for key in ("rmse_v", "n_compared"):
+        value, kind = stated[f"evaluation.json#/asprs/nva/{key}"]
+        assert value == json.dumps(record["asprs"]["nva"][key])
+        assert kind == "DQ_AbsoluteExternalPositionalAccuracy"
+    assert record["asprs"]["nva"]["rmse_v"] == pytest.approx(0.25, abs=1e-3)
 
 
 def test_an_evaluation_from_before_a_part_was_redone_is_not_stated(surface):

@@ -136,6 +136,7 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     if options.out is None:
         return Answer(text, values, is_asked_for=True)
     write_evaluation(options.out, evaluation)
+    _tell_in_metadata(options.out, options.dsm)
     files = [str(options.out / name) for name in EVALUATION_FILES]
     return Answer(f"{text}\n{options.out}: {', '.join(EVALUATION_FILES)} written.", {**values, "files": files}, True)
 
@@ -156,8 +157,17 @@ def _at_points(options: EvaluateOptions, arguments: dict[str, Any], console: Con
     if options.out is None:
         return Answer(text, values, is_asked_for=True)
     names = write_point_evaluation(options.out, found)
+    _tell_in_metadata(options.out, options.dsm)
     files = [str(options.out / name) for name in names]
     return Answer(f"{text}\n{options.out}: {', '.join(names)} written.", {**values, "files": files}, True)
+
+
+def _tell_in_metadata(out: Path, dsm: Path) -> None:
+    """Write the accuracy into the metadata of the surface where the evaluation lies in the folder of its run."""
+    from zlocus.products.metadata import METADATA, write_metadata
+
+    if dsm.resolve().parent == out.resolve() and (out / METADATA).is_file():
+        write_metadata(out)
 
 
 def check_not_input(out: Path, *inputs: Path | None) -> None:

@@ -38,6 +38,9 @@ ACCURACY = {
     "median": ("median difference", "Median difference of the heights from the reference."),
     "nmad": ("normalised median absolute deviation", "Robust standard deviation of the differences."),
 }
+# Points of an evaluation at check points by their ground, and the entries that are stated of each.
+POINT_KINDS = {"nva": "non-vegetated", "vva": "vegetated"}
+POINT_ACCURACY = {"rmse_v": ("vertical accuracy, RMSE_V", "m"), "n_compared": ("number of points compared", "")}
 # The same of standard deviations, in `sigma` of run.json.
 SIGMA = {
     "mean_m": "mean standard deviation of the heights",
@@ -241,6 +244,14 @@ def _absolute(name: str, evaluation: Mapping[str, Any]) -> Iterator[Element]:
     if found.get("n") is not None:
         figure = Figure(f"{name}#/absolute/all/n", "number of cells compared", found["n"])
         yield _reported("DQ_AbsoluteExternalPositionalAccuracy", figure, "directExternal")
+    at_points = evaluation.get("asprs") or {}
+    for kind, ground in POINT_KINDS.items():
+        for key, (measure, unit) in POINT_ACCURACY.items():
+            value = (at_points.get(kind) or {}).get(key)
+            if value is not None:
+                what = f"{measure}, {ground} points"
+                figure = Figure(f"{name}#/asprs/{kind}/{key}", what, value, unit, at_points["standard"])
+                yield _reported("DQ_AbsoluteExternalPositionalAccuracy", figure, "directExternal")
 
 
 def sigma_figures(run: Mapping[str, Any]) -> Iterator[Figure]:
