@@ -34,6 +34,7 @@ from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
 from zlocus.cli.mosaic import MosaicOptions, mosaic
 from zlocus.cli.orient import OrientOptions, TiesOptions, orient, ties
+from zlocus.cli.ortho import OrthoOptions, ortho
 from zlocus.cli.paper import PaperOptions, paper
 from zlocus.cli.products import ProductsOptions, products
 from zlocus.cli.rank import RankOptions, rank
@@ -48,6 +49,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("demo", DemoOptions, demo),
     ("dsm", DsmOptions, dsm),
     ("products", ProductsOptions, products),
+    ("ortho", OrthoOptions, ortho),
     ("cloud", CloudOptions, cloud),
     ("rerun", RerunOptions, rerun),
     ("curves", CurvesOptions, curves),

@@ -23,6 +23,10 @@ EXAMPLES = {
         zlocus dsm scene.yaml -o surface --dem dem.tif --products dtm
         """,
     "products": "zlocus products surface --products contours,dtm",
+    "ortho": """
+        zlocus ortho surface img_1.tif img_2.tif -o ortho
+        zlocus ortho surface multispectral.tif -o ortho --no-mosaic
+        """,
     "cloud": "zlocus cloud scene.yaml -o cloud --reference img_2 --fill interpolate",
     "rerun": "zlocus rerun surface/run.json -o again --inputs images",
     "curves": """

@@ -110,6 +110,13 @@ def cells_of_bounds(
     return CellWindow(int(row0) * unit, int(col0) * unit, int(row1 - row0) * unit, int(col1 - col0) * unit)
 
 
+def cell_centres(geobox: GeoBox) -> NDArray[np.float64]:
+    """Easting and northing of the centres of all cells of a north-up grid, (r, c, 2) m."""
+    t, (rows, cols) = geobox.transform, geobox.shape
+    x, y = t.c + t.a * (np.arange(cols) + 0.5), t.f + t.e * (np.arange(rows) + 0.5)
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
 Value = TypeVar("Value", np.float32, np.bool_)
 
 

@@ -20,8 +20,11 @@ SCENE_SUFFIXES = (".yaml", ".yml")
 VERTICALS = ("ellipsoid", "egm96", "egm2008")
 
 
-def check_inputs(inputs: tuple[Path, ...]) -> None:
-    """Refuse inputs that are neither two images or more, each once, nor one scene file, nor deliveries."""
+def check_inputs(inputs: tuple[Path, ...], may_be_single: bool = False) -> None:
+    """Refuse inputs that are neither two images or more, each once, nor one scene file, nor deliveries.
+
+    may_be_single : one image is enough.
+    """
     if len(inputs) == 1 and (is_scene_file(inputs[0]) or _may_hold_images(inputs[0])):
         return
     for path in inputs:
@@ -29,7 +32,7 @@ def check_inputs(inputs: tuple[Path, ...]) -> None:
     scene_files = [path for path in inputs if is_scene_file(path)]
     if scene_files:
         raise InputError(f"{scene_files[0]} is a scene file and must be the only input. Leave out the other inputs.")
-    if len(inputs) < 2:
+    if len(inputs) < 2 and not (may_be_single and inputs and inputs[0].is_file()):
         given = f"only {inputs[0]} is given" if inputs else "none is given"
         if inputs and not (inputs[0].exists() or str(inputs[0]).startswith("/vsi")):
             raise InputError(f"There is no file {inputs[0]}. Check the path.")

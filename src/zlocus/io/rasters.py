@@ -18,6 +18,7 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio._err import CPLE_BaseError
+from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
@@ -52,7 +53,7 @@ class RasterBands:
 
     dtype : type of the cells. nodata : value that means no data; None where every value is valid.
     descriptions : one name per band, so they also give the number of bands. units : unit of all bands, "" for none.
-    has_colours : the bands are red, green and blue.
+    has_colours : the bands are red, green and blue. meanings : what each band shows; empty: as `has_colours` says.
     has_mask : an internal mask is written with the blocks (for images, in which every value is a valid grey value).
     average_overviews : overviews hold averages. None: averages for float cells and for rasters with a mask, the nearest
     cell for all others (flags and counts). tags : of each band, for other programs.
@@ -64,6 +65,7 @@ class RasterBands:
     units: str = ""
     has_colours: bool = False
     has_mask: bool = False
+    meanings: tuple[ColorInterp, ...] = ()
     average_overviews: bool | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
 
@@ -163,6 +165,8 @@ class RasterSink:
                 if self._bands.tags:
                     dataset.update_tags(band, **self._bands.tags)
             dataset.units = (self._bands.units,) * len(descriptions)
+            if self._bands.meanings:
+                dataset.colorinterp = self._bands.meanings
             statistics = [BandStatistics() for _ in descriptions]
             masks = iter(self._buffers[1]) if self._bands.has_mask else None
             for slices, cells in self._buffers[0]:

@@ -155,12 +155,19 @@ class SceneFile(StrictModel):
         return self
 
 
-def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[[Scene], Scene] | None = None) -> Scene:
+def open_scene(
+    inputs: Sequence[Path],
+    crs: CRS | None = None,
+    chosen: Callable[[Scene], Scene] | None = None,
+    *,
+    may_be_single: bool = False,
+) -> Scene:
     """Open the scene of some images with RPCs, or of one `scene.yaml`.
 
     crs : a projected CRS in metres, whose horizontal part becomes the frame. It overrides the CRS of the file. The
     default is the WGS84 UTM zone of the scene's centre. chosen : for the scene of all views, of which only headers and
     cameras have been read, it returns the scene of the views that are wanted. The pixels of the others are never read.
+    may_be_single : one image is enough, because no surface is made of them.
 
     Raises
     ------
@@ -172,7 +179,7 @@ def open_scene(inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[
     """
     scene_input = _inputs_of_scene(inputs, crs)
     opened = [_open_view(entry, scene_input.folder) for entry in scene_input.entries]
-    if len(opened) < 2:
+    if len(opened) < 2 and not (may_be_single and opened):
         found = f"only {opened[0].entry.path} was found" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {found}. Add images of the same ground.")
     for one, other in _with_shared_rpcs(opened):
