@@ -17,11 +17,11 @@ from rasterio.windows import Window
 
 from zlocus.core.errors import InputError
 from zlocus.core.footprints import Bounds
+from zlocus.io.axis_resampling import resampled
 from zlocus.io.crs import raster_crs
 from zlocus.io.grid_inputs import read_dem
 from zlocus.io.images import RasterImage, open_image
 from zlocus.io.open_raster import cached_raster, open_raster
-from zlocus.io.surface_heights import SAME_CRS
 from zlocus.io.vertical import VerticalDatum
 
 # Cells around a window that are read too, for interpolation.
@@ -69,6 +69,12 @@ class OrthoReference:
     cell_m: float
     height_source: HeightSource
 
+    @property
+    def is_in_frame(self) -> bool:
+        """Whether the ortho-image is in the frame of the scene. GDAL warps another one, in one thread only: it changes
+        the filters of warnings, which threads share."""
+        return self.crs == self.frame
+
     def heights(self, geobox: GeoBox) -> NDArray[np.float32]:
         """Ellipsoidal heights (r, c) m on a grid; NaN where there are none."""
         return self.height_source.read(geobox)
@@ -82,9 +88,8 @@ class OrthoReference:
             The file can no longer be read.
         """
         out, (rows, cols) = np.full(tuple(geobox.shape), np.nan, np.float32), self.image.shape
-        same = self.crs == self.frame
         bounds = geobox.boundingbox.bbox
-        if not same:
+        if not self.is_in_frame:
             bounds = transform_bounds(self.frame.to_wkt(), self.crs.to_wkt(), *bounds)
         if not np.isfinite(bounds).all():
             return out
@@ -108,10 +113,12 @@ class OrthoReference:
                 grey += np.float32(weight) * read.filled(np.nan)
             scale = t.scale(size[0] / shape[1], size[1] / shape[0])
             window_transform = t * t.translation(*low.tolist()) * scale
-        names = (SAME_CRS, SAME_CRS) if same else (self.crs.to_wkt(), self.frame.to_wkt())
+        if self.is_in_frame:
+            return resampled(grey, window_transform, geobox)
         reproject(
-            grey, out, src_transform=window_transform, src_crs=names[0], src_nodata=np.nan,
-            dst_transform=geobox.transform, dst_crs=names[1], dst_nodata=np.nan, resampling=Resampling.cubic,
+            grey, out, src_transform=window_transform, src_crs=self.crs.to_wkt(), src_nodata=np.nan,
+            dst_transform=geobox.transform, dst_crs=self.frame.to_wkt(), dst_nodata=np.nan,
+            resampling=Resampling.cubic,
         )  # fmt: skip
         return out
 

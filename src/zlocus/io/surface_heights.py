@@ -10,13 +10,12 @@ import rasterio
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
-from rasterio.enums import Resampling
-from rasterio.warp import reproject
 from rasterio.windows import Window
 
 from zlocus.core.errors import ConfigError, InputError
 from zlocus.core.footprints import Bounds
 from zlocus.core.scene import is_local
+from zlocus.io.axis_resampling import resampled
 from zlocus.io.crs import checked_crs, raster_crs
 from zlocus.io.grid_inputs import dem_datum
 from zlocus.io.height_values import check_unit, is_fill
@@ -25,10 +24,8 @@ from zlocus.io.vertical import VerticalDatum, check_heights
 
 # Of so many cells of the raster along each side only the lowest and the greatest height are kept.
 PATCH_CELLS = 256
-# Cells around a window that are read too, for bilinear interpolation.
+# Cells around a window that are read too, for bilinear interpolation; of the larger grid.
 MARGIN_CELLS = 2
-# Both sides of the interpolation are in the same frame, whatever it is: GDAL asks for some CRS.
-SAME_CRS = "EPSG:3857"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +67,15 @@ class SurfaceHeights:
         rows, cols = self.shape
         first_col, last_col = ((at - t.c) / t.a for at in (west, east))
         first_row, last_row = ((at - t.f) / t.e for at in (north, south))
-        left, top = max(int(first_col) - MARGIN_CELLS, 0), max(int(first_row) - MARGIN_CELLS, 0)
-        right, bottom = min(int(last_col) + 1 + MARGIN_CELLS, cols), min(int(last_row) + 1 + MARGIN_CELLS, rows)
+        margin = MARGIN_CELLS * max(int(np.ceil(float(geobox.transform.a) / t.a)), 1)
+        left, top = max(int(first_col) - margin, 0), max(int(first_row) - margin, 0)
+        right, bottom = min(int(last_col) + 1 + margin, cols), min(int(last_row) + 1 + margin, rows)
         if left >= right or top >= bottom:
             return heights
         window = Window(left, top, right - left, bottom - top)
         with cached_raster(self.path) as source:
             stored = stored_heights(source, window)
-        reproject(
-            stored, heights, src_transform=t * t.translation(left, top), src_crs=SAME_CRS, src_nodata=np.nan,
-            dst_transform=geobox.transform, dst_crs=SAME_CRS, dst_nodata=np.nan, resampling=Resampling.bilinear,
-        )  # fmt: skip
+        heights = resampled(stored, t * t.translation(left, top), geobox)
         return heights if self.datum.geoid is None else self.datum.ellipsoidal_from_heights(heights, geobox)
 
     def highest_in(self, bounds: Bounds) -> float:

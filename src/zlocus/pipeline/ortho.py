@@ -151,6 +151,7 @@ def pointed_view(
         return PointedView(replace(view, sensor=of_run.sensor, image=of_run.image), "run", {})
     if reference is None:
         return PointedView(view, "delivered", {})
+    threads = threads if reference.is_in_frame else 1
     matches = match_to_ground(view, reference, scene.crs, config.orientation, threads=threads)
     if isinstance(matches, NoGroundMatch):
         return PointedView(view, "delivered", {"reason": matches.reason})
