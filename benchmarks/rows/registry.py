@@ -79,6 +79,8 @@ ROWS: dict[str, Row] = {
     "demo": Row("rows.demo:demo", WITH_RENDERER),
     "mixed": Row("rows.demo:mixed", WITH_RENDERER),
     "ortho": Row("rows.rendered:ortho"),
+    "ortho-images": Row("rows.ortho_images:ortho_images", WITH_RENDERER, is_slow=True),
+    "ortho-control": Row("rows.ortho_images:ortho_control", WITH_RENDERER, is_slow=True),
     "features": Row("rows.methods:features", WITH_RENDERER),
     "kernels": Row("rows.resources:kernels"),
     "speed": Row("rows.resources:speed", WITH_RENDERER, is_slow=True),

@@ -42,10 +42,25 @@ class OrientOptions:
         Path | None,
         typer.Option(help="Table of ground control and check points.", metavar="CSV", rich_help_panel="Control"),
     ] = None
+    control_ortho: Annotated[
+        Path | None,
+        typer.Option(
+            help="Ortho-photo that the images are compared with for control points; needs --control-dem.",
+            metavar="RASTER",
+            rich_help_panel="Control",
+        ),
+    ] = None
+    control_dem: Annotated[
+        Path | None,
+        typer.Option(
+            help="Terrain model for the heights of the ortho-photo.", metavar="RASTER", rich_help_panel="Control"
+        ),
+    ] = None
     control_vertical: Annotated[
         str | None,
         typer.Option(
-            help="Vertical datum of the control points. Default: ellipsoid.",
+            help="Vertical datum of the control points (default: ellipsoid) and of --control-dem (default: what its "
+            "CRS says).",
             metavar=VERTICAL_DATUMS,
             rich_help_panel="Control",
         ),
@@ -80,6 +95,7 @@ def orient(options: OrientOptions, console: Console) -> Answer:
     """Correct all cameras by a bundle adjustment, and write them."""
     request = OrientRequest(
         inputs=tuple(options.inputs), out=options.out, control=options.control,
+        control_ortho=options.control_ortho, control_dem=options.control_dem,
         control_vertical=options.control_vertical, dem=options.dem, dem_vertical=options.dem_vertical,
         crs=options.crs, heights=options.heights, overwrite=options.overwrite,
     )  # fmt: skip

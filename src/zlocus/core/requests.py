@@ -290,9 +290,10 @@ class OrientRequest:
     """Tie points to be found, and with `cameras` the cameras to be corrected. `None` means: not given.
 
     inputs, crs, heights (above the ellipsoid), overwrite : as in `DsmRequest`. control : table of ground control and
-    check points; dem : raster of heights that the ties should have. control_vertical, dem_vertical :
-    their vertical datums, as in `DsmRequest`; None is the ellipsoid for control points, and the datum of the CRS for a
-    DEM.
+    check points; control_ortho, control_dem : ortho-photo and terrain model that images are compared with, both or
+    none; dem : raster of heights that the ties should have. control_vertical, dem_vertical : vertical datums of the
+    control points and of control_dem, and of dem, as in `DsmRequest`; None is the ellipsoid for control points, and the
+    datum of the CRS for a DEM.
 
     Raises
     ------
@@ -306,6 +307,8 @@ class OrientRequest:
     out: Path
     cameras: bool = True
     control: Path | None = None
+    control_ortho: Path | None = None
+    control_dem: Path | None = None
     control_vertical: str | None = None
     dem: Path | None = None
     dem_vertical: str | None = None
@@ -316,7 +319,13 @@ class OrientRequest:
     def __post_init__(self) -> None:
         check_inputs(self.inputs)
         check_heights(self.heights)
-        check_vertical_of("control", self.control, self.control_vertical)
+        if (self.control_ortho is None) != (self.control_dem is None):
+            given, missing = ("ortho", "dem") if self.control_dem is None else ("dem", "ortho")
+            raise ConfigError(
+                f"--control-{given} {self.control_ortho or self.control_dem} is given without --control-{missing}. "
+                "Images are compared with an ortho-photo on the heights of a terrain model: give both, or neither."
+            )
+        check_vertical_of("control", self.control or self.control_dem, self.control_vertical)
         check_vertical_of("dem", self.dem, self.dem_vertical)
 
 

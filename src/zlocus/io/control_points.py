@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from pyproj import CRS
 from zlocus.core.errors import InputError
 from zlocus.core.scene import View
 from zlocus.core.sensor_model import FloatArray
+from zlocus.io.atomic_write import write_atomically
 from zlocus.io.number_table import NumberTable, read_number_table
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.orientation.control import GroundControl
@@ -71,6 +73,31 @@ def read_control(
             "add another, or leave it out",
         )  # fmt: skip
     return control
+
+
+def write_control(path: Path, control: GroundControl, views: Sequence[View]) -> None:
+    """Write control and check points as a table that `read_control` reads, with ellipsoidal heights.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    rows = [(*NEEDED[:4], "sigma", "sigma_z", "role", *NEEDED[4:])]
+    observations = control.observations
+    for view, point, (column, row) in zip(observations.view, observations.point, observations.xy, strict=True):
+        x, y, z = control.xyz[point]
+        sigma, _, sigma_z = control.sigma_m[point]
+        numbers = (f"{x:.4f}", f"{y:.4f}", f"{z:.4f}", f"{sigma:.4f}", f"{sigma_z:.4f}")
+        role = CHECK if control.is_check[point] else CONTROL
+        place = (views[view].name, f"{column:.4f}", f"{row:.4f}")
+        rows.append((control.names[point], *numbers, role, *place))
+
+    def write(part: Path) -> None:
+        with part.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+
+    write_atomically(path, write)
 
 
 def _views(table: NumberTable, views: Sequence[View]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

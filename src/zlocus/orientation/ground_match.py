@@ -133,7 +133,8 @@ class _Comparison:
             first = Affine(cell_m, 0.0, x - cell_m * side / 2, 0.0, -cell_m, y + cell_m * side / 2)
             geobox = GeoBox((side, side), first, self.crs)
             grey, z = self.reference.grey(geobox), self.reference.heights(geobox)
-            middle = float(z[side // 2, side // 2])
+            # The middle of the window lies between four cells.
+            middle = float(z[side // 2 - 1 : side // 2 + 1, side // 2 - 1 : side // 2 + 1].mean())
             if not np.isfinite(middle):
                 return None
             seen = self._seen(sensor, geobox, z, self.pixels_per_cell * factor)
@@ -171,7 +172,7 @@ def match_to_ground(
 
     spacing_m : distance of the windows, equal for images that are to share points; None: by `lattice_spacing`.
     """
-    z_range = _heights_of(reference, crs)
+    z_range = heights_of(reference, crs)
     if z_range is None:
         return NoGroundMatch("the heights hold no value", True)
     box = ground_box(view, z_range, options.max_pointing_px)
@@ -200,7 +201,7 @@ def lattice_spacing(view: View, z_range: tuple[float, float], cell_m: float) -> 
     return max(float(np.sqrt(np.prod(high - low))) / LATTICE, MIN_SPACING_CELLS * cell_m)
 
 
-def _heights_of(reference: GroundReference, crs: CRS) -> tuple[float, float] | None:
+def heights_of(reference: GroundReference, crs: CRS) -> tuple[float, float] | None:
     """Lowest and greatest height (m) of a reference, on a coarse grid."""
     west, south, east, north = reference.area
     cell = max(east - west, north - south) / OVERVIEW_CELLS

@@ -12,12 +12,14 @@ from zlocus.core.progress import Progress, duration
 from zlocus.core.quoting import counted
 from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupRequest
 from zlocus.io.run_record import Stopwatch
+from zlocus.orientation.ortho_control import joined
 from zlocus.pipeline.cloud import oriented_cloud
 from zlocus.pipeline.dsm import TAKES_PLAN_OVER, check_before_opening, prepare_surface
 from zlocus.pipeline.execution.checkpoint import has_plan
 from zlocus.pipeline.extent import Extent, above
 from zlocus.pipeline.open_run import OpenRun, open_cloud_run, open_run
 from zlocus.pipeline.orient import control_points, options_of_command, terrain_heights
+from zlocus.pipeline.ortho_control import ortho_control
 from zlocus.pipeline.run_plan import Plan, orientation_s
 from zlocus.pipeline.setup import open_inputs
 from zlocus.pipeline.surface_products import grid_record, heights_record
@@ -94,6 +96,9 @@ def plan_orient(request: OrientRequest, config: RunConfig, progress: Progress) -
         if request.dem is not None:
             terrain_heights(request.dem, scene, request.dem_vertical)
     options, seconds = options_of_command(config.orientation, request.cameras), orientation_s(scene.views, None)
+    if request.control_ortho is not None:
+        found = ortho_control(request, scene, options, progress).control
+        control = found if control is None else joined(control, found)
     n_pixels, n_control = (
         sum(math.prod(view.image.shape) for view in scene.views),
         0 if control is None else len(control.names),

@@ -23,12 +23,13 @@ def some_names(names: Sequence[str]) -> str:
     return first_names(names, MAX_NAMED)
 
 
-def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress) -> None:
-    """Say which vertical datum is assumed for a DEM where neither the request nor its file names one."""
+def note_dem(dem: Path | None, dem_vertical: str | None, progress: Progress, option: str = "--dem-vertical") -> None:
+    """Say which vertical datum is assumed for a DEM where neither the request nor its file names one. option : that
+    would name it."""
     if dem is not None and dem_vertical is None and lacks_vertical_datum(dem):
         progress.note(
             f"{dem} does not name its vertical datum: its heights are taken to be ellipsoidal. Where they are above a "
-            "geoid, as those of most terrain models, give it with --dem-vertical egm96|egm2008|FILE."
+            f"geoid, as those of most terrain models, give it with {option} egm96|egm2008|FILE."
         )
 
 

@@ -15,15 +15,17 @@ from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import OrientRequest, SetupRequest, check_output
 from zlocus.core.scene import Scene, is_local
-from zlocus.io.control_points import read_control
+from zlocus.io.control_points import read_control, write_control
 from zlocus.io.grid_inputs import dem_datum, read_dem
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, result_record, write_record
 from zlocus.io.vertical import ELLIPSOID, VerticalDatum, named_vertical_datum
 from zlocus.orientation.control import GroundControl, TerrainHeights
 from zlocus.orientation.orientation import Orientation
+from zlocus.orientation.ortho_control import joined
 from zlocus.pipeline.height_range import possible_heights
 from zlocus.pipeline.messages import note_orientation, some_names
+from zlocus.pipeline.ortho_control import ortho_control
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.setup import open_inputs, orient_views
 from zlocus.products.corrected_cameras import SCENE, check_cameras_can_be_written, write_cameras
@@ -35,6 +37,8 @@ TERRAIN_PX = 16.0
 # Tie points that an orientation needs at least, all images together.
 MIN_TIES = 4
 ORIENTATION = "orientation.json"
+# The points found in an ortho-photo, in the form of --control.
+CONTROL_POINTS = "control_points.csv"
 
 
 def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) -> str:
@@ -56,11 +60,16 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         scene = opened_inputs.scene
         if request.cameras:
             check_cameras_can_be_written(request.inputs)
+        options = options_of_command(config.orientation, request.cameras)
         control = None if request.control is None else control_points(request, scene)
         terrain = None if request.dem is None else terrain_heights(request.dem, scene, request.dem_vertical)
     inputs = InputFiles.of([*opened_inputs.files, *control_files(request)], scene, before)
+    of_ortho = None
+    if request.control_ortho is not None:
+        with watch.stage("ortho-photo"):
+            of_ortho = ortho_control(request, scene, options, progress)
+        control = of_ortho.control if control is None else joined(control, of_ortho.control)
     with watch.stage("orient"):
-        options = options_of_command(config.orientation, request.cameras)
         orientation = orient_views(scene, options, progress, control=control, terrain=terrain)
         check_ties(orientation, scene)
         note_orientation(orientation, progress)
@@ -68,6 +77,9 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", orientation, corrected)
         record: dict[str, Any] = orientation_record(orientation, scene)
+        if of_ortho is not None:
+            record["control_ortho"] = of_ortho.found
+            write_control(request.out / CONTROL_POINTS, of_ortho.control, scene.views)
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
         write_record(request.out / ORIENTATION, record)
@@ -150,6 +162,8 @@ def terrain_heights(dem: Path, scene: Scene, vertical: str | None = None) -> Ter
 
 
 def control_files(request: OrientRequest) -> list[Path]:
-    """Files that the control points are read from."""
-    given = [] if request.control is None else [request.control]
-    return [*given, *control_datum(request).files]
+    """Files that the control is read from."""
+    given = [path for path in (request.control, request.control_ortho, request.control_dem) if path is not None]
+    if request.control_dem is not None:
+        given += dem_datum(request.control_dem, request.control_vertical).files
+    return list(dict.fromkeys([*given, *control_datum(request).files]))

@@ -323,10 +323,7 @@ def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticG
     ]) / step).astype(int) + 4  # fmt: skip
     side = spec.size * spec.gsd_m
     origin = (spec.west_m - int(margin[0]) * step, spec.north_m + int(margin[1]) * step)
-    hill = RoundHill(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m)
-    relief = Relief(spec.base_m, spec.relief_m, spec.longest_m, roughness=3.0, hill=hill if spec.hill_m else None)
-    shape = (int(margin[1] + margin[3]), int(margin[0] + margin[2]))
-    bare = natural_ground(spec.seed, origin, step, shape, relief, spec.gsd_m / 2)
+    bare = bare_terrain(spec, origin, (int(margin[1] + margin[3]), int(margin[0] + margin[2])))
     truth_area = TruthArea(int(margin[0]) * step, int(margin[1]) * step, side)
     if spec.kind == "real":
         return realistic_ground(bare, spec.cover, truth_area, spec.seed)
@@ -335,6 +332,14 @@ def build_ground(spec: SceneSpec, exposures: tuple[Exposure, ...]) -> SyntheticG
         return built
     paint = with_lake if spec.trouble in LAKES else with_trouble
     return paint(built, spec.trouble, truth_area, spec.seed)
+
+
+def bare_terrain(spec: SceneSpec, origin: tuple[float, float], shape: tuple[int, int]) -> SyntheticGround:
+    """The terrain of a scene without objects. origin : west and north of its first cell, m; shape : its cells."""
+    side = spec.size * spec.gsd_m
+    hill = RoundHill(spec.west_m + 0.7 * side, spec.north_m - 0.3 * side, side / 7, spec.hill_m)
+    relief = Relief(spec.base_m, spec.relief_m, spec.longest_m, roughness=3.0, hill=hill if spec.hill_m else None)
+    return natural_ground(spec.seed, origin, spec.step_m, shape, relief, spec.gsd_m / 2)
 
 
 def _footprint(spec: SceneSpec, exposure: Exposure) -> FloatArray:
