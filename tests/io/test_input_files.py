@@ -20,8 +20,9 @@ import zlocus.pipeline.tile_run
 from rendered_scenes import HEIGHTS, PART, SMALL_TILES, run
 from zlocus.core.errors import OutputError, StoppedError
 from zlocus.core.options import RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import progress_for
-from zlocus.core.requests import CloudRequest, OrientRequest, RankRequest
+from zlocus.core.requests import CloudRequest, RankRequest
 from zlocus.io.input_files import InputFiles
 from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.cloud import run_cloud

@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 from zlocus.cli.app import app
 from zlocus.core.errors import GeometryError
 from zlocus.core.options import RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import SilentProgress
-from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest
+from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.pipeline.dry_run import plan_cloud, plan_dsm, plan_orient
 from zlocus.pipeline.dsm import run_dsm
 

@@ -24,8 +24,9 @@ from rendered_scenes import GSD_M, HEIGHTS, PART, SMALL_TILES, read, run
 from zlocus.cli.app import app
 from zlocus.core.errors import CoverageError, OutputError, StoppedError
 from zlocus.core.options import ProductOptions, RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import progress_for
-from zlocus.core.requests import FINISHED, CloudRequest, CurvesRequest, OrientRequest, RankRequest
+from zlocus.core.requests import FINISHED, CloudRequest, CurvesRequest, RankRequest
 from zlocus.pipeline.cloud import run_cloud
 from zlocus.pipeline.execution.checkpoint import FOLDER, MANIFEST, TileCheckpoint
 from zlocus.pipeline.finished_record import checksum

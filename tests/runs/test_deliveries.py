@@ -16,8 +16,9 @@ from rasterio.enums import ColorInterp
 from made_up_deliveries import dimap_delivery, maxar_delivery, shots, write_single, zipped
 from rendered_scenes import read, run
 from zlocus.core.options import RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import progress_for
-from zlocus.core.requests import CloudRequest, OrientRequest
+from zlocus.core.requests import CloudRequest
 from zlocus.core.rerun_request import RerunRequest
 from zlocus.io.scene_file import open_scene
 from zlocus.pipeline.cloud import run_cloud

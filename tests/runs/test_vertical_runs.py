@@ -23,8 +23,9 @@ from zlocus.cli.app import app
 from zlocus.core.errors import ConfigError, GeometryError, InputError
 from zlocus.core.footprints import shared_ground
 from zlocus.core.options import RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import SilentProgress, progress_for
-from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest
+from zlocus.core.requests import CloudRequest, DsmRequest
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.io.control_points import read_control

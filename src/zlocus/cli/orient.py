@@ -24,7 +24,8 @@ from zlocus.cli.shared_options import (
     Settings,
     TieHeights,
 )
-from zlocus.core.requests import OrientRequest, check_output
+from zlocus.core.orient_request import OrientRequest
+from zlocus.core.requests import check_output
 
 if TYPE_CHECKING:
     from zlocus.core.options import RunConfig

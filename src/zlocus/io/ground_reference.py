@@ -38,10 +38,10 @@ class HeightSource(Protocol):
 
 @dataclass(frozen=True)
 class TerrainModel:
-    """A terrain model in any CRS. datum : vertical datum of its heights."""
+    """A terrain model in any CRS. vertical_datum : of its heights."""
 
     path: Path
-    datum: VerticalDatum
+    vertical_datum: VerticalDatum
 
     def read(self, geobox: GeoBox) -> NDArray[np.float32]:
         """See `HeightSource`.
@@ -51,7 +51,7 @@ class TerrainModel:
         InputError, ConfigError
             See `read_dem`.
         """
-        return read_dem(self.path, geobox, self.datum, may_miss=True)
+        return read_dem(self.path, geobox, self.vertical_datum, may_miss=True)
 
 
 @dataclass(frozen=True)

@@ -156,30 +156,25 @@ class SceneFile(StrictModel):
 
 
 def open_scene(
-    inputs: Sequence[Path],
-    crs: CRS | None = None,
-    chosen: Callable[[Scene], Scene] | None = None,
-    *,
-    may_be_single: bool = False,
+    inputs: Sequence[Path], crs: CRS | None = None, chosen: Callable[[Scene], Scene] | None = None, least: int = 2
 ) -> Scene:
     """Open the scene of some images with RPCs, or of one `scene.yaml`.
 
     crs : a projected CRS in metres, whose horizontal part becomes the frame. It overrides the CRS of the file. The
     default is the WGS84 UTM zone of the scene's centre. chosen : for the scene of all views, of which only headers and
-    cameras have been read, it returns the scene of the views that are wanted. The pixels of the others are never read.
-    may_be_single : one image is enough, because no surface is made of them.
+    cameras have been read, it returns the scene of the wanted views, whose pixels alone are read. least : number of images.
 
     Raises
     ------
     InputError
         A file is missing, damaged or given twice; an image is empty, constant, without a camera or with that of another
-        one; there are fewer than two images.
+        one; there are too few images.
     ConfigError
         The CRS is not projected in metres.
     """
     scene_input = _inputs_of_scene(inputs, crs)
     opened = [_open_view(entry, scene_input.folder) for entry in scene_input.entries]
-    if len(opened) < 2 and not (may_be_single and opened):
+    if len(opened) < least:
         found = f"only {opened[0].entry.path} was found" if opened else "none was given"
         raise InputError(f"A surface needs two images or more: {found}. Add images of the same ground.")
     for one, other in _with_shared_rpcs(opened):
@@ -264,8 +259,7 @@ def read_scene_file(path: Path, refused: list[RefusedView] | None = None) -> Sce
         raise InputError(f"{path} is not a scene file: it must hold schema: 1 and a list of views.")
     views = document.get("views")
     if isinstance(views, list):
-        entries = [entry for i in range(len(views)) for entry in _view_entry(views, i, path, refused)]
-        document = document | {"views": entries}
+        document |= {"views": [entry for i in range(len(views)) for entry in _view_entry(views, i, path, refused)]}
     return validate_document(SceneFile, document, path)
 
 
@@ -380,8 +374,7 @@ def _inputs_of_scene(inputs: Sequence[Path], crs: CRS | None, refused: list[Refu
 
 def _open_view(entry: ResolvedEntry, folder: Path) -> _OpenedView:
     """A view of which only the header and the camera have been read."""
-    image = open_header(entry.path, entry.colour_image)
-    return _OpenedView(entry, image, entry.camera.read(folder, entry.path))
+    return _OpenedView(entry, open_header(entry.path, entry.colour_image), entry.camera.read(folder, entry.path))
 
 
 def _open_checked_view(entry: ResolvedEntry, folder: Path) -> _OpenedView:

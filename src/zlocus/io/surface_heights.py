@@ -32,7 +32,7 @@ MARGIN_CELLS = 2
 class SurfaceHeights:
     """A raster of heights.
 
-    path : of the raster; crs : its horizontal frame; transform, shape : of its cells; datum : vertical datum of its
+    path : of the raster; crs : its horizontal frame; transform, shape : of its cells; vertical_datum : of its
     heights; highest : (a, b) m, ellipsoidal, the greatest height of each patch of cells, -inf where there is none;
     z_range : lowest and greatest height, m; area : bounds of the patches with a height.
     """
@@ -41,7 +41,7 @@ class SurfaceHeights:
     crs: CRS
     transform: rasterio.Affine
     shape: tuple[int, int]
-    datum: VerticalDatum
+    vertical_datum: VerticalDatum
     highest: NDArray[np.float64]
     z_range: tuple[float, float]
     median: float
@@ -76,7 +76,11 @@ class SurfaceHeights:
         with cached_raster(self.path) as source:
             stored = stored_heights(source, window)
         heights = resampled(stored, t * t.translation(left, top), geobox)
-        return heights if self.datum.geoid is None else self.datum.ellipsoidal_from_heights(heights, geobox)
+        return (
+            heights
+            if self.vertical_datum.geoid is None
+            else self.vertical_datum.ellipsoidal_from_heights(heights, geobox)
+        )
 
     def highest_in(self, bounds: Bounds) -> float:
         """The greatest height (m) within bounds, or a little outside of them; the lowest of all where there is none."""

@@ -52,14 +52,17 @@ def plan_sigma_m(view: View, matches: GroundMatches) -> float:
     return max(float(np.median(length)) / COORDINATE_SIGMAS * pixel_m, MIN_SIGMA_CELLS * matches.cell_m)
 
 
-def joined(one: GroundControl, other: GroundControl) -> GroundControl:
+def joined(control: GroundControl, other_control: GroundControl) -> GroundControl:
     """The points of both."""
     observations = Observations(
-        np.concatenate([one.observations.view, other.observations.view]),
-        np.concatenate([one.observations.point, other.observations.point + len(one)]),
-        np.concatenate([one.observations.xy, other.observations.xy]),
+        np.concatenate([control.observations.view, other_control.observations.view]),
+        np.concatenate([control.observations.point, other_control.observations.point + len(control)]),
+        np.concatenate([control.observations.xy, other_control.observations.xy]),
     )
     return GroundControl(
-        (*one.names, *other.names), np.concatenate([one.xyz, other.xyz]),
-        np.concatenate([one.sigma_m, other.sigma_m]), np.concatenate([one.is_check, other.is_check]), observations,
-    )  # fmt: skip
+        (*control.names, *other_control.names),
+        np.concatenate([control.xyz, other_control.xyz]),
+        np.concatenate([control.sigma_m, other_control.sigma_m]),
+        np.concatenate([control.is_check, other_control.is_check]),
+        observations,
+    )

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from zlocus.core.options import RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import Progress, duration
 from zlocus.core.quoting import counted
-from zlocus.core.requests import CloudRequest, DsmRequest, OrientRequest, SetupRequest
+from zlocus.core.requests import CloudRequest, DsmRequest, SetupRequest
 from zlocus.io.run_record import Stopwatch
 from zlocus.orientation.ortho_control import joined
 from zlocus.pipeline.cloud import oriented_cloud

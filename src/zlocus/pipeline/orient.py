@@ -12,8 +12,9 @@ from zlocus.core.errors import GeometryError
 from zlocus.core.footprints import footprint, ground_sample_distance
 from zlocus.core.grid import grid_from_bounds
 from zlocus.core.options import OrientationOptions, RunConfig
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import Progress
-from zlocus.core.requests import OrientRequest, SetupRequest, check_output
+from zlocus.core.requests import SetupRequest, check_output
 from zlocus.core.scene import Scene, is_local
 from zlocus.io.control_points import read_control, write_control
 from zlocus.io.grid_inputs import dem_datum, read_dem

@@ -13,12 +13,12 @@ from typing import Any
 
 from zlocus.core.errors import InputError, ZlocusError
 from zlocus.core.footprints import Bounds
-from zlocus.core.options import RunConfig
+from zlocus.core.options import OrientationOptions, RunConfig
 from zlocus.core.ortho_request import MOSAIC, MOSAIC_IMAGES, ORTHO_FILES, ORTHO_RECORD, OrthoRequest
 from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.requests import SetupRequest, check_output
 from zlocus.core.resources import cores
-from zlocus.core.scene import Scene, View
+from zlocus.core.scene import View
 from zlocus.io.ground_reference import OrthoReference, open_reference
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, read_record, result_record, write_record
@@ -82,15 +82,15 @@ def run_ortho(request: OrthoRequest, config: RunConfig, progress: Progress) -> d
         raise InputError(f"{folder} holds no {SURFACE}. Give the folder of a surface, or a raster of heights.")
     with watch.stage("open"), progress.stage("Opening images"):
         surface = open_surface(raster, request.surface_vertical)
-        scene = sorted_views(open_scene(request.inputs, surface.crs, may_be_single=True))
-        known = {} if folder is None else views_of_run(folder, progress)
+        scene = sorted_views(open_scene(request.inputs, surface.crs, least=1))
+        run_views = {} if folder is None else views_of_run(folder, progress)
     reference = reference_of(request, folder, surface)
     files = [raster, *([] if reference is None else [reference.image.path])]
     inputs = InputFiles.of([*files, *(path for view in scene.views for path in view.files)], scene)
     with watch.stage("pointing"), progress.stage("Pointing", len(scene.views)) as stage, opencv_in_one_thread():
         pointed = []
         for view in scene.views:
-            pointed.append(pointed_view(view, known, reference, scene, config, workers))
+            pointed.append(pointed_view(view, run_views, reference, config.orientation, workers))
             stage.advance()
     note_pointing(pointed, reference, request, progress)
     parts = parts_of(request, pointed, surface, progress)
@@ -142,20 +142,20 @@ def reference_of(request: OrthoRequest, folder: Path | None, surface: SurfaceHei
 
 
 def pointed_view(
-    view: View, known: dict[Path, View], reference: OrthoReference | None, scene: Scene, config: RunConfig, threads: int
+    view: View, run_views: dict[Path, View], reference: OrthoReference | None, options: OrientationOptions, threads: int
 ) -> PointedView:
     """A view with the camera of the run, or else with its pointing corrected against the reference, where there is
     one."""
-    of_run = known.get(view.path.resolve())
+    of_run = run_views.get(view.path.resolve())
     if of_run is not None:
         return PointedView(replace(view, sensor=of_run.sensor, image=of_run.image), "run", {})
     if reference is None:
         return PointedView(view, "delivered", {})
     threads = threads if reference.is_in_frame else 1
-    matches = match_to_ground(view, reference, scene.crs, config.orientation, threads=threads)
+    matches = match_to_ground(view, reference, reference.frame, options, threads=threads)
     if isinstance(matches, NoGroundMatch):
         return PointedView(view, "delivered", {"reason": matches.reason})
-    found = resected(view, matches.xyz, matches.xy, config.orientation)
+    found = resected(view, matches.xyz, matches.xy, options)
     facts = {
         "n_points": len(matches),
         "n_windows": matches.n_windows,

@@ -11,8 +11,8 @@ import numpy as np
 
 from zlocus.core.errors import GeometryError, InputError
 from zlocus.core.options import OrientationOptions
+from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import Progress
-from zlocus.core.requests import OrientRequest
 from zlocus.core.scene import Scene, is_local
 from zlocus.io.grid_inputs import dem_datum
 from zlocus.io.ground_reference import OrthoReference, TerrainModel, open_reference
@@ -67,12 +67,7 @@ def ortho_control(
             "lies. Give one that covers it."
         )
     spacing_m = float(np.median([lattice_spacing(view, z_range, reference.cell_m) for view in scene.views]))
-    results: dict[int, GroundMatches | NoGroundMatch] = {}
-    with progress.stage("Ortho-photo", len(scene.views)) as stage, opencv_in_one_thread():
-        for number, view in enumerate(scene.views):
-            # GDAL warps the terrain model, and must not do so in several threads: see `OrthoReference.is_in_frame`.
-            results[number] = match_to_ground(view, reference, scene.crs, options, spacing_m)
-            stage.advance()
+    results = _compared(scene, reference, options, spacing_m, progress)
     matches = {number: each for number, each in results.items() if isinstance(each, GroundMatches)}
     missing = {scene.views[number].name: each for number, each in results.items() if isinstance(each, NoGroundMatch)}
     if not matches:
@@ -83,6 +78,19 @@ def ortho_control(
     for sentence in what_was_found(request.control_ortho, control, matches, missing, scene):
         progress.note(sentence)
     return OrthoControl(control, found)
+
+
+def _compared(
+    scene: Scene, reference: OrthoReference, options: OrientationOptions, spacing_m: float, progress: Progress
+) -> dict[int, GroundMatches | NoGroundMatch]:
+    """What each image, by its number, has in common with the ortho-photo."""
+    found = {}
+    with progress.stage("Ortho-photo", len(scene.views)) as stage, opencv_in_one_thread():
+        for number, view in enumerate(scene.views):
+            # GDAL warps the terrain model, and must not do so in several threads: see `OrthoReference.is_in_frame`.
+            found[number] = match_to_ground(view, reference, scene.crs, options, spacing_m)
+            stage.advance()
+    return found
 
 
 def match_record(matches: GroundMatches) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from zlocus.core.jit import kernel
@@ -9,6 +11,16 @@ from zlocus.core.jit import kernel
 # Cells that are not decided yet.
 OPEN = -1
 N_LEVELS = 256
+
+
+class FloodQueue(NamedTuple):
+    """Cells that wait, in a list for each level."""
+
+    first: np.ndarray  # (l) i8: number of the first entry of each level, -1 without any
+    last: np.ndarray  # (l) i8: number of the last entry of each level
+    cells: np.ndarray  # (q) i8: cell of each entry, row by row
+    images: np.ndarray  # (q) i4: image of each entry
+    following: np.ndarray  # (q) i8: number of the following entry of the same level, -1 without any
 
 
 # (r,c) u1, (k,r,c) b1, (r,c) i4 -> None
@@ -24,49 +36,47 @@ def flood(difference, may_show, labels):
     and watershed lines*, on the reversed differences), so that they meet along cells of small ones.
     """
     n_rows, n_cols = labels.shape
-    first, last = np.full(N_LEVELS, -1, np.int64), np.full(N_LEVELS, -1, np.int64)
-    n_most = 4 * n_rows * n_cols
-    cells, images, following = np.empty(n_most, np.int64), np.empty(n_most, np.int32), np.empty(n_most, np.int64)
+    n_most = 4 * n_rows * n_cols  # every cell is queued once by each of its neighbours at most
+    queue = FloodQueue(
+        np.full(N_LEVELS, -1, np.int64), np.full(N_LEVELS, -1, np.int64), np.empty(n_most, np.int64),
+        np.empty(n_most, np.int32), np.empty(n_most, np.int64),
+    )  # fmt: skip
     n_queued = 0
-    for start in range(n_rows * n_cols):
-        image = labels[start // n_cols, start % n_cols]
-        if image >= 0:
-            n_queued = queue_neighbours(start, image, 0, difference, labels, (first, last, cells, images, following),
-                                        n_queued)  # fmt: skip
+    for row in range(n_rows):
+        for col in range(n_cols):
+            if labels[row, col] >= 0:
+                n_queued = queue_neighbours(row, col, 0, difference, labels, queue, n_queued)
     for level in range(N_LEVELS):
-        while first[level] >= 0:
-            entry = first[level]
-            first[level] = following[entry]
-            cell, image = cells[entry], images[entry]
-            row, col = cell // n_cols, cell % n_cols
-            if labels[row, col] != OPEN or not may_show[image, row, col]:
-                continue
-            labels[row, col] = image
-            n_queued = queue_neighbours(cell, image, level, difference, labels,
-                                        (first, last, cells, images, following), n_queued)  # fmt: skip
+        while queue.first[level] >= 0:
+            entry = queue.first[level]
+            queue.first[level] = queue.following[entry]
+            row, col = queue.cells[entry] // n_cols, queue.cells[entry] % n_cols
+            image = queue.images[entry]
+            if labels[row, col] == OPEN and may_show[image, row, col]:
+                labels[row, col] = image
+                n_queued = queue_neighbours(row, col, level, difference, labels, queue, n_queued)
 
 
-# i8, i4, i8, (r,c) u1, (r,c) i4, tuple, i8 -> i8
+# i8, i8, i8, (r,c) u1, (r,c) i4, FloodQueue, i8 -> i8
 @kernel
-def queue_neighbours(cell, image, level, difference, labels, queue, n_queued):
-    """Queue the open neighbours of a cell for an image, and return how many entries the queue has then.
+def queue_neighbours(row, col, level, difference, labels, queue, n_queued):
+    """Queue the open neighbours of a cell for its image; return how many entries the queue has then.
 
-    level : of the cell; queue : first and last entry of each level, and of each entry its cell, image and following
-    entry.
+    level : at which the cell was reached. A neighbour waits at its own level, or at this one if that is higher.
     """
-    first, last, cells, images, following = queue
     n_rows, n_cols = labels.shape
-    row, col = cell // n_cols, cell % n_cols
     for k in range(4):
-        i, j = row + (k == 0) - (k == 1), col + (k == 2) - (k == 3)
-        if not (0 <= i < n_rows and 0 <= j < n_cols) or labels[i, j] != OPEN or n_queued == len(cells):
+        i = row + (1 if k == 0 else -1 if k == 1 else 0)
+        j = col + (1 if k == 2 else -1 if k == 3 else 0)
+        if i < 0 or j < 0 or i >= n_rows or j >= n_cols or labels[i, j] != OPEN:
             continue
-        at = max(level, N_LEVELS - 1 - difference[i, j])
-        cells[n_queued], images[n_queued], following[n_queued] = i * n_cols + j, image, -1
-        if first[at] < 0:
-            first[at] = n_queued
+        at = max(level, N_LEVELS - 1 - int(difference[i, j]))
+        queue.cells[n_queued], queue.images[n_queued] = i * n_cols + j, labels[row, col]
+        queue.following[n_queued] = -1
+        if queue.first[at] < 0:
+            queue.first[at] = n_queued
         else:
-            following[last[at]] = n_queued
-        last[at] = n_queued
+            queue.following[queue.last[at]] = n_queued
+        queue.last[at] = n_queued
         n_queued += 1
     return n_queued
