@@ -9,7 +9,7 @@ import pytest
 
 from bundle_scenes import views_of
 from zlocus.core.errors import InputError
-from zlocus.io.control_points import read_control
+from zlocus.io.control_points import read_control, write_control
 from zlocus.orientation.control import GroundControl, TerrainHeights
 
 HEADER = "name,x,y,z,sigma,sigma_z,role,image,column,row"
@@ -102,3 +102,14 @@ def test_terrain_between_its_cells():
     holed = TerrainHeights(np.where((col == 2) & (row == 1), np.nan, 5.0), 50.0, 900.0, 10.0)
     assert np.isnan(holed.at(np.array([[65.0, 885.0]]))[0]).all()
     assert holed.at(np.array([[85.0, 885.0]]))[0] == pytest.approx(5.0)
+
+
+def test_a_table_that_was_written_is_read_again(tmp_path, views):
+    found = read_control(written(tmp_path, GOOD), views)
+    write_control(tmp_path / "again.csv", found, views)
+    again = read_control(tmp_path / "again.csv", views)
+    assert again.names == found.names
+    assert again.xyz == pytest.approx(found.xyz, abs=1e-4)
+    assert again.sigma_m == pytest.approx(found.sigma_m)
+    assert (again.is_check == found.is_check).all()
+    assert again.observations.xy == pytest.approx(found.observations.xy)

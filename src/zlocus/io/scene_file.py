@@ -162,7 +162,7 @@ def open_scene(
 
     crs : a projected CRS in metres, whose horizontal part becomes the frame. It overrides the CRS of the file. The
     default is the WGS84 UTM zone of the scene's centre. chosen : for the scene of all views, of which only headers and
-    cameras have been read, it returns the scene of the wanted views, whose pixels alone are read. least : number of images.
+    cameras have been read, it returns the scene of the wanted views, whose pixels alone are read. least : of images.
 
     Raises
     ------

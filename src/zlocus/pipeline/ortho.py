@@ -6,7 +6,8 @@ is corrected by comparing it with an ortho-image of the same surface.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from zlocus.products.report.file_names import RECORD
 from zlocus.products.tie_observations import read_observations
 
 SURFACE, ORTHO = "dsm.tif", "ortho.tif"
+ENDING = "_ortho.tif"
 # Images of a mosaic whose pixels differ by more than this factor do not show the same detail.
 ALIKE_PIXELS = 1.5
 
@@ -94,19 +96,45 @@ def run_ortho(request: OrthoRequest, config: RunConfig, progress: Progress) -> d
             stage.advance()
     note_pointing(pointed, reference, request, progress)
     parts = parts_of(request, pointed, surface, progress)
-    with watch.stage("ortho"), made_folder(request.out), opencv_in_one_thread():
-        written = [write_ortho(part.path, part.source, surface, part.area, part.cell_m, progress, workers)
-                   for part in parts]  # fmt: skip
-    records = [record_of(part, counts.__dict__) for part, counts in zip(parts, written, strict=True)]
-    record: dict[str, Any] = {"surface": str(raster), "images": {part.source.name: each for part, each in
-                                                                 zip(parts, records, strict=True)}}  # fmt: skip
     mosaicked = mosaic_parts(request, parts, progress)
-    if mosaicked:
-        with watch.stage("mosaic"), opencv_in_one_thread():
-            record["mosaic"] = make_mosaic(request, mosaicked, surface, progress, workers)
-    shared = result_record(request, config, inputs.record(), watch)
-    write_record(request.out / ORTHO_RECORD, record | shared)
+    with made_folder(request.out), complete_or_removed(request.out, [part.path for part in parts]):
+        with watch.stage("ortho"), opencv_in_one_thread():
+            written = [write_ortho(part.path, part.source, surface, part.area, part.cell_m, progress, workers)
+                       for part in parts]  # fmt: skip
+        records = {part.source.name: record_of(part, vars(counts)) for part, counts in zip(parts, written, strict=True)}
+        record: dict[str, Any] = {"surface": str(raster), "images": records}
+        if mosaicked:
+            with watch.stage("mosaic"), opencv_in_one_thread():
+                record["mosaic"] = make_mosaic(request, mosaicked, surface, progress, workers)
+        shared = result_record(request, config, inputs.record(), watch)
+        write_record(request.out / ORTHO_RECORD, record | shared)
     return record
+
+
+@contextmanager
+def complete_or_removed(out: Path, paths: Sequence[Path]) -> Iterator[None]:
+    """Remove what an earlier command left in the folder, and after a failure what this one has written.
+
+    paths : of the ortho-images that are written.
+    """
+    known = [out / name for name in ORTHO_FILES]
+    for path in (*earlier_files(out), *known):
+        path.unlink(missing_ok=True)
+    try:
+        yield
+    except BaseException:
+        for path in (*paths, *known):
+            path.unlink(missing_ok=True)
+        raise
+
+
+def earlier_files(out: Path) -> list[Path]:
+    """The ortho-images that the record in a folder names; none where it is missing or damaged."""
+    try:
+        names = [str(each["file"]) for each in read_record(out / ORTHO_RECORD)["images"].values()]
+    except (ZlocusError, KeyError, AttributeError, TypeError):
+        return []
+    return [out / name for name in names if Path(name).name == name and name.endswith(ENDING)]
 
 
 def views_of_run(folder: Path, progress: Progress) -> dict[Path, View]:
@@ -210,7 +238,7 @@ def parts_of(
             continue
         source = OrthoSource.of(each.view, surface.median)
         cell_m = request.resolution or source.cell_m
-        parts.append(OrthoPart(request.out / f"{name}_ortho.tif", each, source, area, cell_m))
+        parts.append(OrthoPart(request.out / f"{name}{ENDING}", each, source, area, cell_m))
     if not parts:
         where = "" if request.bounds is None else " within --bounds"
         raise InputError(
