@@ -17,8 +17,9 @@ from zlocus.matching.kernels.sight import mark_hidden
 NODE_CELLS = 64
 # Cells by which a ray rises for the difference that gives its direction.
 RISE_CELLS = 10.0
-# Cells by which the surface must stand above a ray to hide what is behind it: less is its own roughness.
-MARGIN_CELLS = 0.5
+# Cells of the surface by which it must stand above a ray to hide what is behind it (less is its own roughness), and
+# cells of it between the places where a ray is looked at.
+MARGIN_CELLS, STEP_CELLS = 0.5, 0.5
 
 ReadHeights = Callable[[GeoBox], NDArray[np.float32]]
 # The greatest height within bounds, m.
@@ -27,12 +28,17 @@ EVERYWHERE = (-np.inf, -np.inf, np.inf, np.inf)
 
 
 def hidden_cells(
-    sensor: SensorModel, read: ReadHeights, highest: HighestIn, geobox: GeoBox, z: NDArray[np.float32]
+    sensor: SensorModel,
+    read: ReadHeights,
+    highest: HighestIn,
+    geobox: GeoBox,
+    z: NDArray[np.float32],
+    surface_cell_m: float,
 ) -> NDArray[np.bool_]:
     """Which cells of a block the surface hides from a sensor, (r, c) bool.
 
     read : heights (r, c) m on a grid, NaN where there are none; highest : see `HighestIn`; geobox : of the block; z :
-    (r, c) m, its heights, which are not NaN everywhere.
+    (r, c) m, its heights, which are not NaN everywhere; surface_cell_m : side (m) of the cells that the surface has.
     """
     by_height = ray_directions(sensor, geobox, z)
     out = np.zeros(z.shape, np.bool_)
@@ -49,7 +55,10 @@ def hidden_cells(
     whole = GeoBox((z.shape[0] + above + below, z.shape[1] + left + right), whole.transform, geobox.crs)
     surface = np.ascontiguousarray(read(whole), np.float32)
     surface[above : above + z.shape[0], left : left + z.shape[1]] = z
-    mark_hidden(surface, np.array([above, left]), by_height, np.float32(top), np.float32(MARGIN_CELLS * cell_m), out)
+    margin, stride = MARGIN_CELLS * max(surface_cell_m, cell_m), max(STEP_CELLS * surface_cell_m / cell_m, 1.0)
+    mark_hidden(
+        surface, np.array([above, left]), by_height, np.float32(top), np.float32(margin), np.float32(stride), out
+    )
     return out
 
 
@@ -81,7 +90,8 @@ def ray_directions(sensor: SensorModel, geobox: GeoBox, z: NDArray[np.float32]) 
     moved = (above - xyz)[:, :2] / (rise * cell_m) * np.array([1.0, -1.0])
     moved = np.where(np.isfinite(moved).all(axis=1, keepdims=True), moved, 0.0).reshape(len(at_rows), len(at_cols), 2)
     down, across = _weights(at_rows, rows), _weights(at_cols, cols)
-    return np.ascontiguousarray(np.einsum("ri,ijk,cj->rck", down, moved, across), np.float32)
+    on_cells = [down @ part @ across.T for part in moved.transpose(2, 0, 1)]
+    return np.ascontiguousarray(np.stack(on_cells, axis=-1), np.float32)
 
 
 def _weights(nodes: FloatArray, n: int) -> FloatArray:

@@ -108,7 +108,7 @@ def ortho_block(source: OrthoSource, surface: SurfaceHeights, geobox: GeoBox) ->
         inside = ((xy >= -0.5) & (xy <= np.array([cols, rows]) - 0.5)).all(axis=-1)
     if not inside.any():
         return None
-    hidden = hidden_cells(source.sensor, surface.read, surface.highest_in, geobox, z)
+    hidden = hidden_cells(source.sensor, surface.read, surface.highest_in, geobox, z, surface.cell_m)
     wanted = inside & is_known & ~hidden
     counts = OrthoCounts(0, int((hidden & inside).sum()), int((inside & ~is_known).sum()))
     places = np.where(wanted[..., None], source.bands.displaced(xy), np.nan)

@@ -11,12 +11,14 @@ from zlocus.matching.kernels.sight import mark_hidden
 SIDE, WALL_M = 40, 6.0
 
 
-def hidden(surface, by_height, margin=0.0, first=(0, 0), shape=None):
+def hidden(surface, by_height, margin=0.0, first=(0, 0), shape=None, stride=1.0):
     shape = surface.shape if shape is None else shape
     out = np.ones(shape, np.bool_)
     direction = np.broadcast_to(np.asarray(by_height, np.float32), (*shape, 2)).copy()
     top = np.float32(np.nanmax(surface))
-    mark_hidden(surface.astype(np.float32), np.array(first), direction, top, np.float32(margin), out)
+    mark_hidden(
+        surface.astype(np.float32), np.array(first), direction, top, np.float32(margin), np.float32(stride), out
+    )
     return out
 
 
@@ -46,6 +48,12 @@ def test_a_wall_hides_as_many_cells_as_its_height_says():
     assert is_hidden[5, 12:20].all()
     assert not is_hidden[:, :12].any()
     assert not is_hidden[:, 20:].any()
+
+
+def test_longer_steps_find_the_same_wall():
+    surface = np.zeros((SIDE, SIDE))
+    surface[:, 20:24] = WALL_M
+    assert (hidden(surface, (1.5, 0.0), stride=2.0) == hidden(surface, (1.5, 0.0))).mean() > 0.95
 
 
 def test_the_block_lies_within_a_larger_surface():

@@ -11,16 +11,17 @@ from zlocus.core.jit import kernel
 MIN_SPEED = 1e-6
 
 
-# (s,t) f4, (2,) i8, (r,c,2) f4, f4, f4, (r,c) b1 -> None
+# (s,t) f4, (2,) i8, (r,c,2) f4, f4, f4, f4, (r,c) b1 -> None
 @kernel
-def mark_hidden(surface, first, by_height, top, margin, out):
+def mark_hidden(surface, first, by_height, top, margin, stride, out):
     """Mark the cells whose ray to the sensor passes below the surface.
 
     surface : (s, t) float32 heights, m, NaN where there is none; first : row and column in it of the first cell of
     `out`; by_height : (r, c, 2) float32, columns and rows that the ray moves per metre that it rises; top : height
-    above which nothing stands; margin : m by which the surface must stand above the ray; out : (r, c) bool.
+    above which nothing stands; margin : m by which the surface must stand above the ray; stride : cells of a step
+    along a ray; out : (r, c) bool.
 
-    Each ray is followed in steps of one cell, and the surface is interpolated between four cells. Where one of them has
+    Each ray is followed in steps, and the surface is interpolated between four cells. Where one of them has
     no height, nothing is known to stand there.
     """
     n_rows, n_cols = surface.shape
@@ -32,7 +33,7 @@ def mark_hidden(surface, first, by_height, top, margin, out):
             row, col, height = float(first[0] + r), float(first[1] + c), float(surface[first[0] + r, first[1] + c])
             if not speed > MIN_SPEED or np.isnan(height):
                 continue
-            step_col, step_row, gain = by_col / speed, by_row / speed, 1.0 / speed
+            step_col, step_row, gain = stride * by_col / speed, stride * by_row / speed, stride / speed
             while True:
                 col, row, height = col + step_col, row + step_row, height + gain
                 if height > top or not (0.0 <= row < n_rows - 1 and 0.0 <= col < n_cols - 1):
