@@ -81,6 +81,7 @@ RUN_BY = {
     "rows/choice_of_images.py": "test_many_images.py::test_the_default_is_compared_with_the_best_of_the_others",
     "rows/many_images.py": "test_many_images.py::test_false_heights_on_ground_away_from_buildings_are_counted",
     "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
+    "rows/ortho_images.py": "test_ortho_images_row.py::test_a_displaced_ortho_image_is_judged",
     "rows/photographs.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/redo.py": "test_redo_row.py::test_changed_cells_and_mixtures_are_noticed",
     "rows/registry.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",

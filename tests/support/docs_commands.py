@@ -114,6 +114,12 @@ def lay_out_images(folder: Path) -> None:
         file.write(heights, 1)
 
 
+def lay_out_images_and_bands(folder: Path) -> None:
+    """The same, and an image of another sensor."""
+    lay_out_images(folder)
+    shutil.copy(folder / "img_3.tif", folder / "multispectral.tif")
+
+
 def lay_out_images_and_area(folder: Path) -> None:
     """The same, and polygons of an area."""
     lay_out_images(folder)
@@ -352,6 +358,7 @@ LAID_OUT = {
     "docs/how-to/mosaic.md": lay_out_strips,
     "docs/how-to/orient.md": lay_out_images,
     "docs/how-to/redo.md": lay_out_parts,
+    "docs/how-to/ortho.md": lay_out_images_and_bands,
     "docs/how-to/report.md": lay_out_comparison,
     "docs/how-to/vertical.md": lay_out_datums,
     "docs/how-to/water.md": lay_out_lakes,
