@@ -249,6 +249,8 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "MeasuredDistances": ("distances", "wide", "narrow"),
     "ChangeNoise": ("noise",),
     "PairOffset": ("pair",),
+    "FitSample": ("sample",),
+    "OrthoSource": ("source",),
     "PairSample": ("sample",),
     "PlacedSurface": ("placed",),
     "PolygonFeatures": ("features",),

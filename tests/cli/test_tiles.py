@@ -43,8 +43,8 @@ def test_options_reach_the_pipeline(zl, monkeypatch, tmp_path):
     assert done.stdout == f"{planned}\n"
     request, config, n_tasks, _ = asked[0]
     assert request == DsmRequest(
-        inputs=(Path("a.tif"), Path("b.tif")), out=tmp_path / "out", resolution=0.5, heights=(1, 2), products=("dtm",),
-        report=False, memory_gb=2, overwrite=True,
+        inputs=(Path("a.tif"), Path("b.tif")), out=tmp_path / "out", resolution=0.5, heights=(1, 2),
+        products=("hillshade", "dtm"), report=False, memory_gb=2, overwrite=True,
     )  # fmt: skip
     assert config.pyramid.tile > 0
     assert n_tasks == 7

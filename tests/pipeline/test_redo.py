@@ -27,8 +27,8 @@ from zlocus.pipeline.recorded_run import config_of, request_of
 from zlocus.pipeline.redo import run_redo
 from zlocus.pipeline.redo_folder import RedoFolder
 from zlocus.pipeline.rerun import run_again
+from zlocus.products.raster_cells import SurfaceReader
 from zlocus.products.redone_area import RedoneArea
-from zlocus.products.surface_cells import SurfaceReader
 
 RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 # Weaker penalties of jumps, which change nearly every cell.

@@ -33,9 +33,9 @@ from zlocus.pipeline.finished_run import files_gone
 from zlocus.pipeline.redo_options import differing, redo_config, redo_request
 from zlocus.pipeline.water import far_levels
 from zlocus.products.metadata import METADATA
+from zlocus.products.raster_cells import SurfaceReader
 from zlocus.products.redone_area import RAMP_CELLS, RedoneArea
 from zlocus.products.report.file_names import RECORD, REPORT
-from zlocus.products.surface_cells import SurfaceReader
 
 
 @dataclass(frozen=True)

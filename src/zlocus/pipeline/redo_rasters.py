@@ -21,9 +21,9 @@ from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import TileProduct
 from zlocus.products.derived import FILES
 from zlocus.products.metadata import METADATA
+from zlocus.products.raster_cells import RasterCells, SurfaceReader, blended, with_fixed
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import RECORD, REPORT
-from zlocus.products.surface_cells import SurfaceCells, SurfaceReader, blended, with_fixed
 
 RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 
@@ -73,8 +73,8 @@ def write_part(
 
 
 def _levelled(
-    part: RedonePart, row: int, shape: tuple[int, int], old_cells: SurfaceCells, changed_cells: ChangedCells
-) -> SurfaceCells:
+    part: RedonePart, row: int, shape: tuple[int, int], old_cells: RasterCells, changed_cells: ChangedCells
+) -> RasterCells:
     """Cells of a strip, with the level of their polygon."""
     assert part.level_polygons is not None, "callers make sure"
     assert part.levels_m is not None, "polygons have levels"

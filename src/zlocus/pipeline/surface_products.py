@@ -36,6 +36,7 @@ from zlocus.pipeline.setup import RunSetup
 from zlocus.pipeline.tile_run import Tally
 from zlocus.products.acquisitions import acquisition_records
 from zlocus.products.derived import link_all, write_derived
+from zlocus.products.metadata import write_metadata
 from zlocus.products.ortho_colours import colour_records
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES, RECORD
@@ -120,6 +121,8 @@ def write_maps(
     write_record(request.out / "run.json", record)
     if request.report:
         from zlocus.pipeline.report_inputs import try_report
+
+        write_metadata(request.out)  # the report lists it
 
         try_report(request.out, progress)
     link_all(request.out, progress)

@@ -17,7 +17,7 @@ from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.matching.surface import Surface
-from zlocus.products.surface_cells import SurfaceCells
+from zlocus.products.raster_cells import RasterCells
 
 GREY, COLOURS = ("grey value",), ("red", "green", "blue")
 
@@ -86,7 +86,7 @@ class SurfaceRasters:
         self._views.write(row, col, cells.views)
         self._ortho.write(row, col, cells.ortho, cells.has_grey)
 
-    def cells_of(self, row: int, col: int, surface: Surface) -> SurfaceCells:
+    def cells_of(self, row: int, col: int, surface: Surface) -> RasterCells:
         """What `write` writes of a block of cells whose first cell is (row, col) of the grid; no water is known."""
         height = self._vertical.heights_from_ellipsoidal(surface.height, self._geobox, row, col)
         bands = np.moveaxis(np.atleast_3d(surface.ortho), -1, 0)
@@ -96,9 +96,9 @@ class SurfaceRasters:
         shape = (len(self._bands), *valid.shape)
         ortho = as_source(np.broadcast_to(np.where(valid, bands, 0), shape), self._ortho_dtype)
         none = np.full(valid.shape, WaterKind.LAND, np.uint8)
-        return SurfaceCells(height, surface.sigma, surface.quality, surface.views, ortho, valid, none)
+        return RasterCells(height, surface.sigma, surface.quality, surface.views, ortho, valid, none)
 
-    def write_cells(self, row: int, col: int, cells: SurfaceCells) -> None:
+    def write_cells(self, row: int, col: int, cells: RasterCells) -> None:
         """Write cells as they are, with their water, from (row, col) of the grid on."""
         self._dsm.write(row, col, cells.height)
         self._sigma.write(row, col, cells.sigma)

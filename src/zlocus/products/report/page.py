@@ -13,6 +13,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from zlocus.core.errors import InputError
+from zlocus.core.requests import EVENTS
 from zlocus.core.scene import is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.atomic_write import write_atomically
@@ -146,9 +147,16 @@ def context(out: Path, comparison: Comparison | None) -> dict[str, Any]:
 
 
 def file_rows(out: Path) -> list[FileRow]:
-    """The files of a result, in the order of its catalogue item, which is written after the report."""
+    """The files of a result, in the order of its catalogue item, which is written after the report.
+
+    The event log has no size: later commands add to it, and the same page would have another one.
+    """
     return [
-        FileRow(product.name, product.title, _size_words((out / product.name).stat().st_size))
+        FileRow(
+            product.name,
+            product.title,
+            "" if product.name == EVENTS else _size_words((out / product.name).stat().st_size),
+        )
         for product in PRODUCTS
         if product.name != REPORT and (out / product.name).is_file()
     ]

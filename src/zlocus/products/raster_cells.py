@@ -26,7 +26,7 @@ AGREEING_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
-class SurfaceCells:
+class RasterCells:
     """Cells of the rasters of a surface, (r, c).
 
     height, sigma : float32 m, NaN for none; quality : uint16; views : uint8; ortho : (bands, r, c) of the type of the
@@ -46,7 +46,7 @@ class SurfaceCells:
         """All arrays, in the order of the fields."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
-    def differs_from(self, other: SurfaceCells) -> NDArray[np.bool_]:
+    def differs_from(self, other: RasterCells) -> NDArray[np.bool_]:
         """Cells (r, c) bool in which any raster has another value."""
         differs = np.zeros(self.height.shape, np.bool_)
         for one, two in zip(self.arrays, other.arrays, strict=True):
@@ -89,14 +89,14 @@ class SurfaceReader:
         """Whether the ortho-image has colours."""
         return int(self._files[4].count) > 1
 
-    def read(self, row: int, col: int, shape: tuple[int, int]) -> SurfaceCells:
+    def read(self, row: int, col: int, shape: tuple[int, int]) -> RasterCells:
         """Cells from (row, col) on. shape : rows and columns."""
         window = Window(col, row, shape[1], shape[0])
         dsm, sigma, quality, views, ortho, water = self._files
         height, spread, flags, n_views, kind = (
             file.read(1, window=window) for file in (dsm, sigma, quality, views, water)
         )
-        return SurfaceCells(
+        return RasterCells(
             height, spread, flags, n_views, ortho.read(window=window), ortho.dataset_mask(window=window) > 0, kind
         )
 
@@ -109,7 +109,7 @@ class SurfaceReader:
         self._stack.__exit__(kind, error, trace)
 
 
-def blended(old_cells: SurfaceCells, new_cells: SurfaceCells, weight: NDArray[np.float32]) -> SurfaceCells:
+def blended(old_cells: RasterCells, new_cells: RasterCells, weight: NDArray[np.float32]) -> RasterCells:
     """Cells of a surface, replaced by new ones as far as a weight says.
 
     weight : (r, c) from 0 to 1, 0 outside the area that is redone. Heights that agree (`AGREEING_SIGMAS`) pass from the
@@ -134,10 +134,10 @@ def blended(old_cells: SurfaceCells, new_cells: SurfaceCells, weight: NDArray[np
     spread = np.where(both, old_cells.sigma + weight * (new_cells.sigma - old_cells.sigma), spread)
     # Possible water stays marked where there is no height again.
     water = np.where(is_new & ~new_has, old_cells.water, water)
-    return SurfaceCells(height, spread, flags, views, ortho, has_grey, water)
+    return RasterCells(height, spread, flags, views, ortho, has_grey, water)
 
 
-def with_fixed(cells: SurfaceCells, heights: NDArray[np.float64]) -> SurfaceCells:
+def with_fixed(cells: RasterCells, heights: NDArray[np.float64]) -> RasterCells:
     """Cells of which some have a height that was given. heights : (r, c) m, NaN in the others.
 
     Such a cell counts as filled: no image has told its height, and it has no standard deviation. Cells that were not
@@ -147,7 +147,7 @@ def with_fixed(cells: SurfaceCells, heights: NDArray[np.float64]) -> SurfaceCell
     flags = (cells.quality & np.uint16(EMPTY)) | np.uint16(Quality.FILLED)
     flags = np.where(is_water(cells.quality), flags | np.uint16(Quality.WATER), flags)
     none = np.float32(np.nan)
-    return SurfaceCells(
+    return RasterCells(
         np.where(is_fixed, heights.astype(np.float32), cells.height), np.where(is_fixed, none, cells.sigma),
         np.where(is_fixed, flags, cells.quality), np.where(is_fixed, np.uint8(0), cells.views),
         cells.ortho, cells.has_grey, cells.water,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from zlocus.matching.quality import Quality
-from zlocus.products.surface_cells import SurfaceCells, SurfaceReader, blended, with_fixed
+from zlocus.products.raster_cells import RasterCells, SurfaceReader, blended, with_fixed
 
 SHAPE = (3, 4)
 NOTHING = np.float32(np.nan)
@@ -15,7 +15,7 @@ NOTHING = np.float32(np.nan)
 
 def cells(height, sigma=0.5, quality=0, views=3, grey=7, water=0):
     """Cells of one kind."""
-    return SurfaceCells(
+    return RasterCells(
         np.full(SHAPE, height, np.float32), np.full(SHAPE, sigma, np.float32), np.full(SHAPE, quality, np.uint16),
         np.full(SHAPE, views, np.uint8), np.full((1, *SHAPE), grey, np.uint16), np.ones(SHAPE, bool),
         np.full(SHAPE, water, np.uint8),
@@ -81,7 +81,7 @@ def test_possible_water_is_land_where_there_is_a_height_now():
 )
 def test_a_surface_blended_with_itself_keeps_its_bytes(height, weight):
     old = cells(0.0)
-    old = SurfaceCells(height, *old.arrays[1:])
+    old = RasterCells(height, *old.arrays[1:])
     assert same(blended(old, old, weight), old)
 
 
@@ -109,6 +109,6 @@ def test_cells_are_read_as_they_were_written(small_surface):
     with SurfaceReader(small_surface) as reader:
         rows, cols = reader.geobox.shape
         whole, part = reader.read(0, 0, (rows, cols)), reader.read(3, 5, (7, 9))
-    assert same(part, SurfaceCells(*(array[..., 3:10, 5:14] for array in whole.arrays)))
+    assert same(part, RasterCells(*(array[..., 3:10, 5:14] for array in whole.arrays)))
     assert whole.height.dtype == np.float32
     assert np.isfinite(whole.height).any()
