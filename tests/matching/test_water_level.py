@@ -14,6 +14,7 @@ from zlocus.matching.water_level import (
     WaterHeights,
     is_confident,
     shore_cells,
+    tells_level,
     water_level,
     weighted_quantile,
 )
@@ -88,6 +89,13 @@ def test_doubtful_heights_do_not_count():
     sure = is_confident(np.ones(quality.shape, np.float32), quality)
     np.testing.assert_array_equal(sure[0], [True] * 3 + [False] * (len(flags) - 3))
     assert not is_confident(np.full((1, 1), np.nan, np.float32), np.zeros((1, 1), np.uint16)).any()
+
+
+def test_imprecise_heights_tell_no_level():
+    sigma = np.array([[0.1, 0.25, 0.26, np.nan]], np.float32)
+    height, quality = np.ones(sigma.shape, np.float32), np.zeros(sigma.shape, np.uint16)
+    np.testing.assert_array_equal(tells_level(height, sigma, quality, 0.5), [[True, True, False, False]])
+    assert not tells_level(height, sigma, quality | np.uint16(Quality.WEAK), 0.5).any()
 
 
 @pytest.mark.parametrize("width", [1.0, 2.5, 3.0])

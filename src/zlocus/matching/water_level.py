@@ -23,6 +23,9 @@ from zlocus.matching.quality import EMPTY, Quality
 NOT_CONFIDENT = np.uint16(
     EMPTY | Quality.WEAK | Quality.AMBIGUOUS | Quality.JUMP | Quality.FILLED | Quality.DISPUTED | Quality.PLANE
 )
+# Heights tell a level up to this standard deviation, in sides of a cell. On rendered lakes levels are off by .064 m
+# (root mean square) with it and by .071 m without, from three views; from two views there is no difference.
+MAX_SIGMA_CELLS = 0.5
 # Quantile of the heights at the shore, weighted by their precision, for outlines that are given. On rendered lakes with
 # three views, quantiles from 7.5 to 12.5 % and widths from 4 to 6 cells are off by the same .05 m (root mean square).
 # Where the outline is 1 m too wide or too narrow, low quantiles and wide bands are the best: these are off by .07 m.
@@ -93,8 +96,16 @@ def weighted_quantile(heights: NDArray[np.float32], sigma: NDArray[np.float32], 
     return float(heights[order[np.searchsorted(weight, share * weight[-1])]])
 
 
+def tells_level(
+    height: NDArray[np.float32], sigma: NDArray[np.float32], quality: NDArray[np.uint16], cell_m: float
+) -> NDArray[np.bool_]:
+    """(r, c) bool: confident and precise cells, whose heights tell a level. height, sigma : (r, c) m; quality : (r, c)
+    uint16; cell_m : side of a cell."""
+    return np.asarray(is_confident(height, quality) & (sigma <= np.float32(MAX_SIGMA_CELLS * cell_m)))
+
+
 def is_confident(height: NDArray[np.float32], quality: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """(r, c) bool: cells whose height tells a level. height : (r, c) m; quality : (r, c) uint16."""
+    """(r, c) bool: cells with a height and without a sign of doubt. height : (r, c) m; quality : (r, c) uint16."""
     return np.asarray(np.isfinite(height) & ((quality & NOT_CONFIDENT) == 0))
 
 

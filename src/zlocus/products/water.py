@@ -27,6 +27,7 @@ from zlocus.matching.water_level import (
     WaterLevel,
     is_confident,
     shore_cells,
+    tells_level,
     water_level,
 )
 from zlocus.products.rasters import SurfaceRasters, WaterKind
@@ -103,6 +104,7 @@ class WaterCells:
 
     def __init__(self, polygons: NDArray[Any], geobox: GeoBox) -> None:
         self._polygons, self._geobox, self._tree = polygons, geobox, shapely.STRtree(polygons)
+        self.cell_m = float(geobox.transform.a)
 
     def numbers(self, row: int, col: int, shape: tuple[int, int]) -> NDArray[np.int32]:
         """Number of the surface of each cell, from 1, 0 for none, (r, c) int32. row, col : the first cell."""
@@ -234,13 +236,14 @@ def _heights_of(rasters: SurfaceRasters, cells: WaterCells, number: int, width_c
         is_own = np.zeros(part.is_surface.shape, np.bool_)
         is_own[part.own] = True
         is_sure = is_confident(written.height, written.quality) & is_own
+        is_exact = tells_level(written.height, written.sigma, written.quality, cells.cell_m) & is_own
         is_away = part.is_surface & ~at_shore.water & is_own
         n_inside += int(is_away.sum())
         inside.append(written.height[is_away & is_sure])
-        is_beside = (at_shore.water | at_shore.land) & is_sure
+        is_beside = (at_shore.water | at_shore.land) & is_exact
         shore.append(written.height[is_beside])
         sigma.append(written.sigma[is_beside])
-        beyond.append(written.height[at_shore.land & is_sure])
+        beyond.append(written.height[at_shore.land & is_exact])
     return WaterHeights(n_inside, *(np.concatenate(each) for each in (inside, shore, sigma, beyond)))
 
 
