@@ -91,11 +91,11 @@ def test_doubtful_heights_do_not_count():
     assert not is_confident(np.full((1, 1), np.nan, np.float32), np.zeros((1, 1), np.uint16)).any()
 
 
-def test_imprecise_heights_tell_no_level():
-    sigma = np.array([[0.1, 0.25, 0.26, np.nan]], np.float32)
-    height, quality = np.ones(sigma.shape, np.float32), np.zeros(sigma.shape, np.uint16)
-    np.testing.assert_array_equal(tells_level(height, sigma, quality, 0.5), [[True, True, False, False]])
-    assert not tells_level(height, sigma, quality | np.uint16(Quality.WEAK), 0.5).any()
+def test_imprecise_heights_of_several_pairs_tell_no_level():
+    sigma, views = np.array([[0.1, 0.25, 0.26, 0.26]], np.float32), np.array([[3, 3, 3, 2]], np.uint8)
+    is_sure = np.ones(sigma.shape, bool)
+    np.testing.assert_array_equal(tells_level(is_sure, sigma, views, 0.5), [[True, True, False, True]])
+    assert not tells_level(~is_sure, sigma, views, 0.5).any()
 
 
 @pytest.mark.parametrize("width", [1.0, 2.5, 3.0])

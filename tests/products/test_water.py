@@ -17,7 +17,7 @@ from zlocus.core.options import WaterOptions
 from zlocus.io.water_polygons import WaterPolygons
 from zlocus.matching.quality import Quality
 from zlocus.matching.surface import Surface
-from zlocus.matching.water_level import MAX_SIGMA_CELLS, shore_cells, tells_level
+from zlocus.matching.water_level import MAX_SIGMA_CELLS, is_confident, shore_cells, tells_level
 from zlocus.products.rasters import SurfaceRasters, WaterKind
 from zlocus.products.water import level_water, without_cells
 
@@ -131,7 +131,7 @@ def test_every_cell_beside_the_shore_is_used_once(tmp_path, matched, monkeypatch
     matched.sigma[::3] = MAX_SIGMA_CELLS * CELL_M * 1.01  # too imprecise
     _, found = made(tmp_path, matched, polygons(LAKE_SHAPE, POND_SHAPE))
     lake, pond = cells_of(LAKE_SHAPE), cells_of(POND_SHAPE)
-    sure = tells_level(matched.height, matched.sigma, matched.quality, CELL_M)
+    sure = tells_level(is_confident(matched.height, matched.quality), matched.sigma, matched.views, CELL_M)
     for one, inside in zip(found.levelled_surfaces, (lake, pond), strict=True):
         at_shore = shore_cells(inside, lake | pond, OPTIONS.shore_cells)
         assert one.level.n_used == (sure & (at_shore.water | at_shore.land)).sum()

@@ -23,8 +23,8 @@ from zlocus.matching.quality import EMPTY, Quality
 NOT_CONFIDENT = np.uint16(
     EMPTY | Quality.WEAK | Quality.AMBIGUOUS | Quality.JUMP | Quality.FILLED | Quality.DISPUTED | Quality.PLANE
 )
-# Heights tell a level up to this standard deviation, in sides of a cell. On rendered lakes levels are off by .064 m
-# (root mean square) with it and by .071 m without, from three views; from two views there is no difference.
+# Heights of three images or more tell a level up to this standard deviation, in sides of a cell. On rendered lakes
+# levels from three views are off by .064 m (root mean square) with it and by .071 m without.
 MAX_SIGMA_CELLS = 0.5
 # Quantile of the heights at the shore, weighted by their precision, for outlines that are given. On rendered lakes with
 # three views, quantiles from 7.5 to 12.5 % and widths from 4 to 6 cells are off by the same .05 m (root mean square).
@@ -97,11 +97,15 @@ def weighted_quantile(heights: NDArray[np.float32], sigma: NDArray[np.float32], 
 
 
 def tells_level(
-    height: NDArray[np.float32], sigma: NDArray[np.float32], quality: NDArray[np.uint16], cell_m: float
+    is_sure: NDArray[np.bool_], sigma: NDArray[np.float32], views: NDArray[np.uint8], cell_m: float
 ) -> NDArray[np.bool_]:
-    """(r, c) bool: confident and precise cells, whose heights tell a level. height, sigma : (r, c) m; quality : (r, c)
-    uint16; cell_m : side of a cell."""
-    return np.asarray(is_confident(height, quality) & (sigma <= np.float32(MAX_SIGMA_CELLS * cell_m)))
+    """(r, c) bool: cells whose heights tell the level at a shore.
+
+    is_sure : (r, c) bool, see `is_confident`; sigma : (r, c) m; views : (r, c), images that measured each height. A
+    single pair cannot contradict itself, and its standard deviations say less; all its heights count. cell_m : side of
+    a cell.
+    """
+    return np.asarray(is_sure & ((views <= 2) | (sigma <= np.float32(MAX_SIGMA_CELLS * cell_m))))
 
 
 def is_confident(height: NDArray[np.float32], quality: NDArray[np.uint16]) -> NDArray[np.bool_]:

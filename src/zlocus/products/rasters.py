@@ -33,11 +33,13 @@ class WaterKind(IntEnum):
 
 @dataclass(frozen=True)
 class WrittenHeights:
-    """height, sigma : (r, c) float32 m, in the vertical datum of the result; quality : (r, c) uint16, see `Quality`."""
+    """height, sigma : (r, c) float32 m, in the vertical datum of the result; quality : (r, c) uint16, see `Quality`;
+    views : (r, c) uint8, number of images."""
 
     height: NDArray[np.float32]
     sigma: NDArray[np.float32]
     quality: NDArray[np.uint16]
+    views: NDArray[np.uint8]
 
 
 class SurfaceRasters:
@@ -109,7 +111,9 @@ class SurfaceRasters:
 
     def heights(self, row: int, col: int, shape: tuple[int, int]) -> WrittenHeights:
         """Heights of cells that are written, whose first is (row, col) of the grid. shape : rows and columns."""
-        return WrittenHeights(*(sink.read(row, col, shape) for sink in (self._dsm, self._sigma, self._quality)))
+        return WrittenHeights(
+            *(sink.read(row, col, shape) for sink in (self._dsm, self._sigma, self._quality, self._views))
+        )
 
     def grey(self, row: int, col: int, shape: tuple[int, int]) -> NDArray[Any]:
         """Grey values, or values of the first colour, of the ortho-image as it is written, (r, c); see `heights`."""

@@ -236,7 +236,7 @@ def _heights_of(rasters: SurfaceRasters, cells: WaterCells, number: int, width_c
         is_own = np.zeros(part.is_surface.shape, np.bool_)
         is_own[part.own] = True
         is_sure = is_confident(written.height, written.quality) & is_own
-        is_exact = tells_level(written.height, written.sigma, written.quality, cells.cell_m) & is_own
+        is_exact = tells_level(is_sure, written.sigma, written.views, cells.cell_m)
         is_away = part.is_surface & ~at_shore.water & is_own
         n_inside += int(is_away.sum())
         inside.append(written.height[is_away & is_sure])
