@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import shutil
@@ -195,6 +196,7 @@ def test_memory_does_not_grow_with_the_number_of_tiles(images, tmp_path):
     made(images, tmp_path / "first", references=("nadir",), partial=True)
     peaks = []
     for name, references in (("one", ("nadir",)), ("three", ())):
+        gc.collect()
         tracemalloc.start()
         made(images, tmp_path / name, references=references, partial=True)
         peaks.append(tracemalloc.get_traced_memory()[1])
