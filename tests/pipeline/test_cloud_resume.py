@@ -202,4 +202,5 @@ def test_memory_does_not_grow_with_the_number_of_tiles(images, tmp_path):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     arrays_bytes = 2 * SIZE_PX**2 * CLOUD_PIXEL_BYTES
-    assert peaks[1] - peaks[0] < 0.3 * arrays_bytes
+    # Held arrays would count as a whole; the records of two more images take a third of that here.
+    assert peaks[1] - peaks[0] < 0.5 * arrays_bytes
