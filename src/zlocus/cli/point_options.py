@@ -32,7 +32,7 @@ class PointFileOptions:
     points_vertical: Annotated[
         str | None,
         typer.Option(
-            help="What heights of points are above. Default: what their CRS says, or the same as the surface.",
+            help="Vertical datum of the heights of points. Default: that of their CRS, or that of the surface.",
             metavar="ellipsoid|egm96|egm2008|FILE", rich_help_panel=POINTS,
         ),
     ] = None  # fmt: skip

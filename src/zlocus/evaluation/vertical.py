@@ -124,7 +124,7 @@ def stated_datum(crs: CRS | None, path: Path, description: str = "") -> str | No
 
 
 def above(datum: str | None) -> str:
-    """What heights are above, in words. datum : see `datum_of`."""
+    """The vertical datum of heights as a sentence names it. datum : see `datum_of`."""
     return f"the {ELLIPSOID}" if datum == ELLIPSOID else str(datum).removeprefix("height above ")
 
 

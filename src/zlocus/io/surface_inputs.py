@@ -83,7 +83,7 @@ class SurfaceInput:
         return math.sqrt(abs(self.transform.determinant))
 
     def vertical_datum(self, geoid: Path | None) -> VerticalDatum:
-        """What the heights are above. geoid : raster or name of the geoid of heights that are not ellipsoidal.
+        """The vertical datum of the heights. geoid : raster or name of the geoid of heights that are not ellipsoidal.
 
         Raises
         ------
