@@ -10,17 +10,16 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
 
+from displaced_windows import displacements
 from seeds import fresh_seeds, over_seeds
-from workplace import ZLOCUS, CannotRun, Figure, Workplace, run
+from workplace import ZLOCUS, Figure, Workplace, run
 from zlocus.io.scene_file import open_scene
-from zlocus.orientation.edge_correlation import peak_of
 from zlocus.orientation.triangulate import Observations, triangulate
 from zlocus.synthetic.appearance import Changes, Moment, ground_in_view
 from zlocus.synthetic.files import fit_exposure, render_scene, write_image
@@ -39,9 +38,6 @@ from zlocus.synthetic.terrain import SyntheticGround
 TOWN_CELLS, PIXEL_M = 360, 0.5
 N_SEEDS = 3
 NO_NOISE = {"noise": 0.0, "noise_floor": 0.0}
-# Windows in which an ortho-image is compared with the truth: side, step, and how far the two may lie apart, px; and the
-# correlation from which on the windows show the same.
-WINDOW_PX, STEP_PX, SEARCH_PX, MIN_CORRELATION = 48, 24, 4, 0.7
 MAX_OFF_PX = 0.3
 # Control: pointing errors of this size, each in another direction; the ortho-photo has other pixels, light and houses.
 POINTING_PX, PHOTO_M, TERRAIN_M, REBUILT_SHARE, DAILY = 10.0, 0.3, 2.0, 0.25, 0.3
@@ -109,48 +105,6 @@ def write_photo(path: Path, numbers: NDArray[np.generic], camera: OrthographicCa
         blockxsize=256, blockysize=256, crs=f"EPSG:{spec.epsg}", transform=camera.transform,
     ) as file:  # fmt: skip
         file.write(numbers)
-
-
-def displacements(ortho: Path, truth: Path) -> NDArray[np.float64]:
-    """How far windows of an ortho-image lie from those of the truth, (n, 2) px, all bands together.
-
-    Raises
-    ------
-    CannotRun
-        No window of the two agrees.
-    """
-    with rasterio.open(ortho) as file, rasterio.open(truth) as true:
-        row, col = (round(at) for at in ((file.transform.f - true.transform.f) / -PIXEL_M,
-                                         (file.transform.c - true.transform.c) / PIXEL_M))  # fmt: skip
-        top, left = max(row, 0), max(col, 0)
-        bottom, right = min(row + file.height, true.height), min(col + file.width, true.width)
-        inside = slice(top - row, bottom - row), slice(left - col, right - col)
-        found = []
-        for band in range(1, file.count + 1):
-            shown, valid = file.read(band)[inside].astype(np.float32), file.read_masks(band)[inside] > 0
-            known = true.read(band)[top:bottom, left:right].astype(np.float32)
-            found += _displaced_windows(known, shown, valid)
-    if not found:
-        raise CannotRun(f"{ortho} shows nothing of {truth}")
-    return np.array(found)
-
-
-def _displaced_windows(
-    known: NDArray[np.float32], shown: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> list[tuple[float, float]]:
-    found = []
-    rows, cols = known.shape
-    for row in range(0, rows - WINDOW_PX + 1, STEP_PX):
-        for col in range(0, cols - WINDOW_PX + 1, STEP_PX):
-            part = slice(row, row + WINDOW_PX), slice(col, col + WINDOW_PX)
-            if valid[part].mean() < 0.98:
-                continue
-            template = known[part][SEARCH_PX:-SEARCH_PX, SEARCH_PX:-SEARCH_PX]
-            surface = cv2.matchTemplate(shown[part], template, cv2.TM_CCOEFF_NORMED)
-            peak = peak_of(surface.astype(float))
-            if peak is not None and surface.max() >= MIN_CORRELATION:
-                found.append((peak.col, peak.row))
-    return found
 
 
 def ortho_control(workplace: Workplace) -> list[Figure]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from affine import Affine
 
-from rows.ortho_images import PIXEL_M, controlled_spec, displacements, write_photo
+from displaced_windows import displacements
+from rows.ortho_images import PIXEL_M, controlled_spec, write_photo
 from zlocus.synthetic.ortho_photo import FOUR_BANDS, OrthographicCamera, exposed_bands
 from zlocus.synthetic.render import Sun
 from zlocus.synthetic.scenes import build_ground, exposures_of

@@ -9,7 +9,8 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
-from ortho_scenes import FOUR_BANDS, PIXEL_M, displacements, town, truth_of, write_photo, write_view
+from displaced_windows import displacements
+from ortho_scenes import FOUR_BANDS, PIXEL_M, town, truth_of, write_photo, write_view
 from rendered_scenes import PART, rendered, run
 from zlocus.cli.app import app
 from zlocus.core.ortho_request import MOSAIC, MOSAIC_IMAGES, ORTHO_RECORD

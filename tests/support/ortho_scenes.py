@@ -6,12 +6,10 @@ import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from zlocus.orientation.edge_correlation import peak_of
 from zlocus.synthetic.files import fit_exposure, write_image
 from zlocus.synthetic.ortho_photo import (
     FOUR_BANDS,
@@ -115,30 +113,3 @@ def truth_of(made: Town, name: str, bands=FOUR_BANDS) -> Path:
     quiet = [replace(band, optics=replace(band.optics, noise=0.0, noise_floor=0.0)) for band in bands]
     sun = made.exposure(name).view.sun
     return write_photo(made, made.folder / f"truth_{name}.tif", sun, quiet)
-
-
-def displacements(ortho: Path, truth: Path, side: int = 48, search: int = 4):
-    """How far windows of all bands of an ortho-image lie from the truth, (n, 2) px."""
-    found = []
-    with rasterio.open(ortho) as file, rasterio.open(truth) as true:
-        at, origin = file.transform, true.transform
-        row, col = round((origin.f - at.f) / PIXEL_M), round((origin.c - at.c) / PIXEL_M)
-        inside = (
-            slice(max(-row, 0), min(true.height - row, file.height)),
-            slice(max(-col, 0), min(true.width - col, file.width)),
-        )
-        for band in range(1, file.count + 1):
-            shown, valid = file.read(band)[inside].astype(np.float32), file.read_masks(band)[inside] > 0
-            top, left = inside[0].start + row, inside[1].start + col
-            known = true.read(band)[top : top + shown.shape[0], left : left + shown.shape[1]].astype(np.float32)
-            for i in range(0, shown.shape[0] - side + 1, side // 2):
-                for j in range(0, shown.shape[1] - side + 1, side // 2):
-                    part = slice(i, i + side), slice(j, j + side)
-                    if valid[part].mean() < 0.95:
-                        continue
-                    template = known[part][search:-search, search:-search]
-                    surface = cv2.matchTemplate(shown[part], template, cv2.TM_CCOEFF_NORMED)
-                    peak = peak_of(surface.astype(float))
-                    if peak is not None and surface.max() > 0.7:
-                        found.append((peak.col, peak.row))
-    return np.array(found)

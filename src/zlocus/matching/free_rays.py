@@ -7,8 +7,10 @@ show the surface behind it, and there other images agree with them.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -82,40 +84,66 @@ class PairAgreement:
         return np.asarray(is_seen > 0, np.bool_)
 
 
-def pair_agreement(grey: NDArray[np.float32], covering: NDArray[np.bool_]) -> PairAgreement:
+class _BoxedImage(NamedTuple):
+    """An image on a surface, only in a box around the cells that it covers: outside it agrees with no other.
+
+    box : rows and columns; grey, mean, inverse : (m, n) float32 of the box: grey values, their means in windows, and
+    the inverse of their standard deviations; is_covered, is_plain : (m, n), cells that are covered, and without
+    texture.
+    """
+
+    box: Part
+    grey: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    inverse: NDArray[np.float32]
+    is_covered: NDArray[np.bool_]
+    is_plain: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, image: NDArray[np.float32], covers_cell: NDArray[np.bool_]) -> _BoxedImage:
+        """An image in its box. image : (r, c) float32; covers_cell : (r, c), cells that it covers."""
+        box = _box_around(covers_cell)
+        grey, is_covered = image[box].copy(), covers_cell[box]
+        if not grey.size:
+            return cls(box, grey, grey, grey, is_covered, is_covered)
+        mean = _mean(grey)
+        variance = _mean(grey * grey) - mean * mean
+        inverse = np.reciprocal(np.sqrt(np.maximum(variance, np.float32(MIN_VARIANCE))))
+        is_plain = (variance < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE**2)) & is_covered
+        return cls(box, grey, mean, inverse, is_covered, is_plain)
+
+    def part(self, box: Part) -> _BoxedImage:
+        """The image on a part of its box. box : rows and columns of the whole surface."""
+        inside = (
+            slice(box[0].start - self.box[0].start, box[0].stop - self.box[0].start),
+            slice(box[1].start - self.box[1].start, box[1].stop - self.box[1].start),
+        )
+        grey, mean, inverse = (each[inside] for each in (self.grey, self.mean, self.inverse))
+        return _BoxedImage(box, grey, mean, inverse, self.is_covered[inside], self.is_plain[inside])
+
+
+def pair_agreement(grey: Iterable[NDArray[np.float32]], covering: NDArray[np.bool_]) -> PairAgreement:
     """Count the images that agree with each image on each cell.
 
-    grey : (i, r, c) float32, the images resampled on a surface, in units of their standard deviations; covering :
-    (i, r, c) bool, where an image covers that surface.
+    grey : (r, c) float32 each, the images resampled on a surface, one after the other, in units of their standard
+    deviations, 0 where they do not cover it; covering : (i, r, c) bool, where an image covers that surface.
     """
-    boxes = [_box_around(shows) for shows in covering]
-    mean, inverse = np.zeros_like(grey), np.zeros_like(grey)
-    is_plain = np.zeros(grey.shape, np.bool_)
-    for i, box in enumerate(boxes):
-        image = grey[i][box]
-        if not image.size:
+    images = [_BoxedImage.of(image, shows) for image, shows in zip(grey, covering, strict=True)]
+    textured, untextured = np.zeros(covering.shape, np.uint8), np.zeros(covering.shape, np.uint8)
+    for i, j in combinations(range(len(images)), 2):
+        box = _shared(images[i].box, images[j].box)
+        if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
             continue
-        mean[i][box] = _mean(image)
-        variance = _mean(image * image) - mean[i][box] * mean[i][box]
-        inverse[i][box] = 1.0 / np.sqrt(np.maximum(variance, np.float32(MIN_VARIANCE)))
-        is_plain[i][box] = (variance < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE**2)) & covering[i][box]
-    textured, untextured = np.zeros(grey.shape, np.uint8), np.zeros(grey.shape, np.uint8)
-    for i, j in combinations(range(len(grey)), 2):
-        box = _shared(boxes[i], boxes[j])
-        (grey_i, mean_i, inverse_i), (grey_j, mean_j, inverse_j) = (
-            (grey[k][box], mean[k][box], inverse[k][box]) for k in (i, j)
-        )
-        if not grey_i.size:
-            continue
-        apart = np.abs(grey_i - grey_j)
-        ncc = (_mean(grey_i * grey_j) - mean_i * mean_j) * (inverse_i * inverse_j)
+        first, second = images[i].part(box), images[j].part(box)
+        apart = np.abs(first.grey - second.grey)
+        ncc = (_mean(first.grey * second.grey) - first.mean * second.mean) * (first.inverse * second.inverse)
         is_alike = (ncc > np.float32(MIN_NCC)) & (apart < np.float32(MAX_GREY_DIFFERENCE))
-        agree = is_alike & covering[i][box] & covering[j][box]
-        both_plain = is_plain[i][box] & is_plain[j][box] & (apart < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE))
+        agree = is_alike & first.is_covered & second.is_covered
+        both_plain = first.is_plain & second.is_plain & (apart < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE))
         for view in (i, j):
             textured[view][box] += agree
             untextured[view][box] += both_plain
-    return PairAgreement(textured, untextured, covering.sum(axis=0))
+    return PairAgreement(textured, untextured, covering.sum(axis=0, dtype=np.int32))
 
 
 def _box_around(mask: NDArray[np.bool_]) -> Part:
@@ -139,8 +167,11 @@ def agreement_on(tile_views: TileViews, surface: NDArray[np.float32], covering: 
     tile_views : projections of level indices; surface : (r, c) float32, level indices; covering : (i, r, c) bool, where
     a view covers it.
     """
-    grey = np.stack([ortho_image(tile_views, surface, view, shows) for view, shows in enumerate(covering)])
-    return pair_agreement(np.where(covering, grey, np.float32(0.0)), covering)
+    grey = (
+        np.where(shows, ortho_image(tile_views, surface, view, shows), np.float32(0.0))
+        for view, shows in enumerate(covering)
+    )
+    return pair_agreement(grey, covering)
 
 
 def free_rays(

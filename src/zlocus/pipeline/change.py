@@ -18,6 +18,7 @@ from rasterio.windows import Window
 from scipy.stats import norm
 
 from zlocus.core.errors import InputError, OutputError
+from zlocus.core.findings import Findings
 from zlocus.core.grid import CellWindow
 from zlocus.core.progress import Progress
 from zlocus.core.requests import check_output
@@ -56,14 +57,6 @@ MIN_STABLE_CELLS = 1000
 # Cells beside a polygon that do not count as unchanged.
 RIM_CELLS = 3
 NMAD = 1.4826
-
-
-@dataclass(frozen=True)
-class ChangeResult:
-    """What `zlocus change` made. text : for people; values : the same for programs."""
-
-    text: str
-    values: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -116,7 +109,7 @@ class _Pair:
         return StableWindow(window.row, window.col, difference, sigma, np.stack([across, -down], axis=-1))
 
 
-def run_change(request: ChangeRequest, progress: Progress) -> ChangeResult:
+def run_change(request: ChangeRequest, progress: Progress) -> Findings:
     """Subtract two surfaces, and write the results into the folder of the request.
 
     Raises
@@ -159,7 +152,7 @@ def run_change(request: ChangeRequest, progress: Progress) -> ChangeResult:
     written = [name for name in CHANGE_FILES if (request.out / name).is_file()]
     text = _text(request, noise, counts, features, volumes)
     values: dict[str, Any] = {key: record[key] for key in ("noise", "cells", "volumes") if key in record}
-    return ChangeResult(
+    return Findings(
         "\n".join([*text, f"{request.out}: {', '.join(written)} written."]),
         {"files": [str(request.out / name) for name in written], **values},
     )

@@ -15,6 +15,7 @@ from pyproj import CRS
 from pyproj.crs import CompoundCRS
 
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.findings import Findings
 from zlocus.core.grid import CellWindow
 from zlocus.core.progress import Progress
 from zlocus.core.quoting import counted
@@ -62,14 +63,6 @@ MAX_RUNS = 65_535
 
 
 @dataclass(frozen=True)
-class MosaicResult:
-    """What `zlocus mosaic` made. text : for people; values : the same for programs."""
-
-    text: str
-    values: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class _Placement:
     """The surfaces on the common grid. windows : cells that each may reach; n_covered : cells of all their windows."""
 
@@ -96,7 +89,7 @@ class _Placement:
         return GeoBox(self.geobox.shape, self.geobox.transform, parts.to_wkt())
 
 
-def run_mosaic(request: MosaicRequest, progress: Progress) -> MosaicResult:
+def run_mosaic(request: MosaicRequest, progress: Progress) -> Findings:
     """Join surfaces, and write the result into the folder of the request.
 
     Raises
@@ -146,7 +139,7 @@ def run_mosaic(request: MosaicRequest, progress: Progress) -> MosaicResult:
         }  # fmt: skip
         write_record(request.out / RECORD, record)
     files = [str(request.out / name) for name in (*names, PICTURE, RECORD)]
-    return MosaicResult(
+    return Findings(
         _text(request, counts, offsets, is_removed, (*names, PICTURE, RECORD)),
         {"files": files, **{key: record[key] for key in ("grid", "offsets", "runs", "cells", "feather_cells")}},
     )
