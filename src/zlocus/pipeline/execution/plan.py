@@ -23,8 +23,9 @@ from zlocus.matching.view_pixels import FIRST_KEPT_LEVEL, PYRAMID_BYTES, PYRAMID
 # (docs/development/experiments/growth.md, docs/development/experiments/close_cameras.md).
 CELL_S, VIEW_CELL_S = 2e-6, 3e-6
 # Peak memory of a tile: for each cell; for each cell and height step; for each cell and view that shows it; for each
-# pixel that the views show of the cells (docs/development/experiments/growth.md).
-CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, PIXEL_BYTES = 65, 3, 23, 12
+# cell and view of the tile that does not show it; for each pixel that the views show of the cells
+# (docs/development/experiments/growth.md).
+CELL_BYTES, STEP_BYTES, VIEW_CELL_BYTES, OTHER_VIEW_CELL_BYTES, PIXEL_BYTES = 65, 3, 23, 10, 12
 STEPS_PER_CELL = 48
 # Memory of the reduced parts of an image for each of its pixels: five bytes for each pixel of a level.
 REDUCED_BYTES = 5 / 4**FIRST_KEPT_LEVEL * 4 / 3
@@ -92,7 +93,10 @@ def tile_needs(match_scene: MatchScene, tiles: Sequence[Tile], config: RunConfig
             tile.core_window, 0, config.pyramid.halo, config.pyramid.block, match_scene.overlap_window
         )  # fmt: skip
         cells, shown = fine.rows * fine.cols, _shown_pixels(match_scene, tile.core_window, fine, config)
-        per_cell = CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * shown.views_of_cell
+        n_other = len(shown.pixels) - shown.views_of_cell
+        per_cell = (
+            CELL_BYTES + STEP_BYTES * steps + VIEW_CELL_BYTES * shown.views_of_cell + OTHER_VIEW_CELL_BYTES * n_other
+        )
         most = max(most, int(cells * per_cell + sum(shown.pixels) * PIXEL_BYTES))
         seconds += tile.core_window.rows * tile.core_window.cols * (CELL_S + VIEW_CELL_S * shown.views_of_cell)
     return TileNeeds(most, seconds * len(worked) / max(len(looked), 1))
