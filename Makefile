@@ -19,10 +19,12 @@ endif
     numbers release-check clean
 .DEFAULT_GOAL := test
 
+# Modules are compiled by all cores, which pip would do with one; a few files of packages are templates and cannot be.
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "zlocus needs Python 3.11 or newer: make PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install $(PIP_OPTIONS) --editable '.[dev]'
+	$(BIN)/python -m pip install $(PIP_OPTIONS) --no-compile --editable '.[dev]'
+	$(BIN)/python -m compileall -qq -j 0 .venv/lib || true
 	touch $@
 
 ifneq (,$(WORDS))
@@ -40,7 +42,9 @@ endif
 docs: $(STAMP)
 	$(BIN)/python -m sphinx -W --keep-going -E -q -b html -d build/doctrees docs build/docs
 
+# Kernels are compiled first: processes of tests would each compile them.
 test: lint
+	$(BIN)/python -m zlocus.pipeline.execution.precompile
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # Tests of single modules, for use while editing: under two minutes on two cores. tests/conftest.py lists what is left out.
@@ -53,6 +57,7 @@ test-minimum: $(STAMP)
 	$(BIN)/python tests/support/lowest_versions.py \
 	    "$$($(MINIMUM)/bin/python -c 'import sys; print(*sys.version_info[:2], sep=".")')" > $(MINIMUM)/versions.txt
 	$(MINIMUM)/bin/python -m pip install $(PIP_OPTIONS) --constraint $(MINIMUM)/versions.txt --editable '.[test]'
+	$(MINIMUM)/bin/python -m zlocus.pipeline.execution.precompile
 	$(MINIMUM)/bin/python -m pytest -n 2 --dist worksteal
 
 # Known vulnerabilities of what is installed, from the package registry.

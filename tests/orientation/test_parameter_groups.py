@@ -199,7 +199,7 @@ def test_corrections_of_many_images_are_told_in_short(oriented):
     assert "up to " in what_was_applied(many)
 
 
-SIZE_PX, STEP_PX, N_VIEWS = 120, 40, 60
+SIZE_PX, STEP_PX, N_VIEWS = 120, 40, 40
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,7 @@ def test_the_demo_runs_twice_into_one_folder(tmp_path, monkeypatch):
     whole = scenes.demo_spec()
     small = replace(
         whole,
-        size=200,
+        size=150,
         hill_m=0.0,
         objects=replace(whole.objects, buildings_per_ha=0.0, towers_per_ha=0.0),
         views=whole.views[:3],

@@ -79,7 +79,7 @@ def test_all_sensors_together_are_better_than_the_best_alone(scenes, tmp_path):
 
 
 def test_of_one_house_no_block_more_is_lost_than_by_the_best_alone(spec, tmp_path):
-    scenes = render_mixed_scene(replace(spec, seed=demo_spec().seed), tmp_path / "scene")
+    scenes = render_mixed_scene(replace(spec, seed=demo_spec().seed, size=160), tmp_path / "scene")
     _, within = judged(scenes, tmp_path)
     assert within["mixed"] >= max(within[kind] for kind in SENSORS)
 

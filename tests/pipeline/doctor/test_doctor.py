@@ -470,7 +470,7 @@ def test_a_scene_file_of_bad_entries_only(tmp_path):
 
 def test_every_kind_of_sensor(tmp_path):
     whole = demo_spec()
-    spec = replace(whole, size=240, hill_m=0.0, objects=replace(whole.objects, towers_per_ha=0.0))
+    spec = replace(whole, size=150, hill_m=0.0, objects=replace(whole.objects, towers_per_ha=0.0))
     scenes = render_mixed_scene(spec, tmp_path / "scene")
     status, text, report = doctor(tmp_path / "out", scenes["mixed"])
     assert status == 0, text

@@ -1,6 +1,7 @@
 """Compile the kernels in advance, in separate processes, while other work runs; the cache on disk serves all processes.
 
-`python -m zlocus.pipeline.execution.precompile GROUP` runs one group of kernels on a scene of a few cells.
+`python -m zlocus.pipeline.execution.precompile GROUP` runs one group of kernels on a scene of a few cells; without a
+group, all are compiled that are not there yet.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from zlocus.core.grid import CellWindow
 from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
-from zlocus.core.progress import Progress, SilentProgress, duration
+from zlocus.core.progress import Progress, SilentProgress, duration, progress_for
 from zlocus.core.resources import cores
 from zlocus.core.scene import ImageWindow, View
 from zlocus.core.sensor_model import FloatArray
@@ -243,4 +244,8 @@ def warm_for_another(group: str) -> None:
 
 
 if __name__ == "__main__":
-    warm(sys.argv[1])
+    if len(sys.argv) > 1:
+        warm(sys.argv[1])
+    else:
+        with kernels_compiling(progress_for(sys.stderr)):
+            pass
