@@ -22,6 +22,7 @@ RUN_BY = {
     "rows/other_programs.py": "test_acceptance.py::test_the_rows_of_other_programs_are_those_of_their_last_run",
     "conftest.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "coregistration.py": "test_acceptance.py::test_planted_shifts_are_found",
+    "displaced_windows.py": "test_ortho_images_row.py::test_a_displaced_ortho_image_is_judged",
     "double_mapping.py": "test_surfaces.py::test_cells_that_show_what_hides_them",
     "frame_block.py": "test_frame_block.py::test_a_block_is_planned_and_a_part_of_it_matched",
     "inspecting.py": "test_speed.py::test_clicks_on_a_surface_are_timed",

@@ -17,8 +17,8 @@ from odc.geo.geobox import GeoBox
 from rasterio.windows import Window
 from scipy.stats import norm
 
+from zlocus.core.command_outcome import CommandOutcome
 from zlocus.core.errors import InputError, OutputError
-from zlocus.core.findings import Findings
 from zlocus.core.grid import CellWindow
 from zlocus.core.progress import Progress
 from zlocus.core.requests import check_output
@@ -109,7 +109,7 @@ class _Pair:
         return StableWindow(window.row, window.col, difference, sigma, np.stack([across, -down], axis=-1))
 
 
-def run_change(request: ChangeRequest, progress: Progress) -> Findings:
+def run_change(request: ChangeRequest, progress: Progress) -> CommandOutcome:
     """Subtract two surfaces, and write the results into the folder of the request.
 
     Raises
@@ -152,7 +152,7 @@ def run_change(request: ChangeRequest, progress: Progress) -> Findings:
     written = [name for name in CHANGE_FILES if (request.out / name).is_file()]
     text = _text(request, noise, counts, features, volumes)
     values: dict[str, Any] = {key: record[key] for key in ("noise", "cells", "volumes") if key in record}
-    return Findings(
+    return CommandOutcome(
         "\n".join([*text, f"{request.out}: {', '.join(written)} written."]),
         {"files": [str(request.out / name) for name in written], **values},
     )

@@ -14,8 +14,8 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS
 from pyproj.crs import CompoundCRS
 
+from zlocus.core.command_outcome import CommandOutcome
 from zlocus.core.errors import ConfigError, InputError
-from zlocus.core.findings import Findings
 from zlocus.core.grid import CellWindow
 from zlocus.core.progress import Progress
 from zlocus.core.quoting import counted
@@ -89,7 +89,7 @@ class _Placement:
         return GeoBox(self.geobox.shape, self.geobox.transform, parts.to_wkt())
 
 
-def run_mosaic(request: MosaicRequest, progress: Progress) -> Findings:
+def run_mosaic(request: MosaicRequest, progress: Progress) -> CommandOutcome:
     """Join surfaces, and write the result into the folder of the request.
 
     Raises
@@ -139,7 +139,7 @@ def run_mosaic(request: MosaicRequest, progress: Progress) -> Findings:
         }  # fmt: skip
         write_record(request.out / RECORD, record)
     files = [str(request.out / name) for name in (*names, PICTURE, RECORD)]
-    return Findings(
+    return CommandOutcome(
         _text(request, counts, offsets, is_removed, (*names, PICTURE, RECORD)),
         {"files": files, **{key: record[key] for key in ("grid", "offsets", "runs", "cells", "feather_cells")}},
     )

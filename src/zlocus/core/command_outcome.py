@@ -8,7 +8,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Findings:
+class CommandOutcome:
     """What a command found and wrote. text : for people; values : the same for programs."""
 
     text: str
