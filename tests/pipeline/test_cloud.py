@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,12 @@ import rasterio
 import yaml
 from typer.testing import CliRunner
 
+from copc_format import checked_nodes
 from las_format import check_laz
 from places import ROOT
 from rendered_scenes import CENTRE, FIELD, GSD_M, HEIGHTS, LOOKS, QUIET, camera
 from zlocus.cli.app import app
-from zlocus.core.errors import CoverageError
+from zlocus.core.errors import CoverageError, OutputError
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import CloudRequest
@@ -247,11 +249,33 @@ def test_levels_are_left_out_where_no_block_fits(images, tmp_path, monkeypatch):
 
 def test_one_reference_is_kept_unconfirmed(images, tmp_path):
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("fore",)}
-    result = run(images("plane").inputs, tmp_path / "out", **asked)
+    result = run(images("plane").inputs, tmp_path / "out", copc=True, **asked)
     assert sorted(p.name for p in result.out.iterdir()) == [
-        "cloud.laz", "cloud.ply", "finished.json", "fore_height.tif", "fore_quality.tif", "run.json",
+        "cloud.copc.laz", "cloud.laz", "cloud.ply", "finished.json", "fore_height.tif", "fore_quality.tif", "run.json",
     ]  # fmt: skip
     assert not (read(result.out / "fore_quality.tif") & Quality.INCONSISTENT).any()
+    assert "cloud.copc.laz" in json.loads((result.out / "finished.json").read_text())["products"]
+
+
+def test_copc_is_made_of_a_finished_cloud(of_step, images, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(of_step.out, out)
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    asked = {"crs": "EPSG:32632", "heights": HEIGHTS}
+    assert run(images("step").inputs, out, copc=True, **asked).was_finished
+    changed = {path.name for path in out.iterdir() if before.get(path.name) != path.stat().st_mtime_ns}
+    assert changed == {"cloud.copc.laz", "finished.json"}
+    checked_nodes(out / "cloud.copc.laz")
+    check_laz(out / "cloud.copc.laz")
+    one, other = (laspy.read(out / name).points.array for name in ("cloud.laz", "cloud.copc.laz"))
+    assert sorted(point.tobytes() for point in one) == sorted(point.tobytes() for point in other)
+    (out / "cloud.copc.laz").unlink()
+    assert run(images("step").inputs, out, **asked).was_finished
+    assert not (out / "cloud.copc.laz").exists()
+    assert run(images("step").inputs, out, copc=True, **asked).was_finished
+    (out / "cloud.copc.laz").write_bytes(b"other")
+    with pytest.raises(OutputError, match=r"cloud\.copc\.laz is not what the run wrote"):
+        run(images("step").inputs, out, **asked)
 
 
 def test_workers_change_nothing(images, tmp_path):
@@ -316,13 +340,13 @@ def test_options_reach_the_run(monkeypatch, tmp_path):
     arguments = ["cloud", "a.tif", "b.tif", "-o", tmp_path / "o", "--reference", "a", "--reference", "b", "--crs",
                  "EPSG:32631", "--heights", -3, 9, "--fill", "interpolate", "--partial", "--workers", 2,
                  "--overwrite", "--bounds", 1, 2, 3, 4, "--area", "area.gpkg", "--memory", 3,
-                 "--no-resume"]  # fmt: skip
+                 "--no-resume", "--copc"]  # fmt: skip
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     assert "12 points" in result.stdout
     assert recorder.request == CloudRequest(
         (Path("a.tif"), Path("b.tif")), tmp_path / "o", ("a", "b"), "EPSG:32631", (-3, 9), "interpolate", True, 2, True,
-        bounds=(1, 2, 3, 4), area=Path("area.gpkg"), memory_gb=3, resume=False,
+        bounds=(1, 2, 3, 4), area=Path("area.gpkg"), memory_gb=3, resume=False, copc=True,
     )  # fmt: skip
 
 

@@ -74,8 +74,9 @@ def test_every_product_opens_and_is_valid(surface):
             assert file.read(1).shape == (60, 80)
             assert {f"STATISTICS_{name}" for name in ("MINIMUM", "MAXIMUM", "MEAN", "STDDEV")} <= set(file.tags(1))
     assert pyogrio.read_info(surface / "contours.gpkg")["features"] > 10
-    with laspy.open(surface / "surface.laz") as laz:
-        assert laz.header.point_count == 56 * 80
+    for name in ("surface.laz", "surface.copc.laz"):
+        with laspy.open(surface / name) as laz:
+            assert laz.header.point_count == 56 * 80
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32632+5773"])

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
+from copc_format import checked_nodes
 from las_format import check_laz
 from zlocus.core.errors import OutputError
 from zlocus.io.crs import local_frame
 from zlocus.io.open_raster import open_raster
-from zlocus.products.point_cloud import LAZ_STEP_M, PLY_POINT, PointCloud, file_names, write_map
+from zlocus.products.point_cloud import LAZ_STEP_M, PLY_POINT, PointCloud, file_names, write_cloud_copc, write_map
 
 UTM = CRS.from_epsg(32632)
 LAMBERT = CRS("+proj=lcc +lat_1=46 +lat_2=48 +lat_0=47 +lon_0=8 +datum=WGS84 +units=m")
@@ -51,6 +52,23 @@ def test_laz_holds_precision_and_number_of_images(tmp_path):
     assert (cloud["sigma_m"].dtype, cloud["n_images"].dtype) == (np.float32, np.uint8)
     about = {dimension.name: dimension.description for dimension in cloud.point_format.extra_dimensions}
     assert about == {"sigma_m": "standard deviation along ray, m", "n_images": "images used"}
+
+
+@pytest.mark.parametrize("crs", [UTM, local_frame()])
+def test_copc_holds_the_same(tmp_path, crs):
+    assert write_cloud_copc(written(tmp_path, crs)) == len(XYZ)
+    (node,) = checked_nodes(tmp_path / "cloud.copc.laz")
+    laz, copc = laspy.read(tmp_path / "cloud.laz"), laspy.read(tmp_path / "cloud.copc.laz")
+    assert node.points.tobytes() == laz.points.array.tobytes() == copc.points.array.tobytes()
+    assert copc.header.parse_crs() == laz.header.parse_crs()
+    assert copc.header.generating_software == laz.header.generating_software
+
+
+def test_copc_of_no_points(tmp_path):
+    with PointCloud(tmp_path, UTM):
+        pass
+    assert write_cloud_copc(tmp_path) == 0
+    checked_nodes(tmp_path / "cloud.copc.laz")
 
 
 def test_ply_holds_the_same(tmp_path):

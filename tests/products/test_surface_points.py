@@ -9,11 +9,12 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
+from copc_format import checked_nodes
 from las_format import check_laz
 from zlocus.core.errors import InputError, OutputError
 from zlocus.io.crs import local_frame
 from zlocus.io.rasters import write_cog
-from zlocus.products.surface_points import write_surface_points
+from zlocus.products.surface_points import write_surface_copc, write_surface_points
 
 CELL_M, WEST, NORTH = 0.5, 499999.0, 4000000.0
 STEP_M = 0.0005 + 1e-9  # half of what the file can tell
@@ -79,35 +80,53 @@ def test_colours_of_other_images(tmp_path):
     assert not np.array_equal(laz.red, laz.blue)
 
 
-def test_in_a_local_frame_there_is_no_crs(tmp_path):
+def test_copc_has_the_same_points(tmp_path):
+    written(tmp_path)
+    n_points = write_surface_points(tmp_path, tmp_path / "surface.laz")
+    assert write_surface_copc(tmp_path, tmp_path / "surface.copc.laz", 37) == n_points
+    nodes = checked_nodes(tmp_path / "surface.copc.laz")
+    check_laz(tmp_path / "surface.copc.laz")
+    laz, copc = laspy.read(tmp_path / "surface.laz"), laspy.read(tmp_path / "surface.copc.laz")
+    order = np.argsort(copc.points.array, order=["Y", "X"])
+    want = laz.points.array[np.argsort(laz.points.array, order=["Y", "X"])]
+    assert copc.points.array[order].tobytes() == want.tobytes()
+    assert sum(len(node.points) for node in nodes) == n_points
+    assert copc.header.parse_crs() == CRS("EPSG:32632")
+    assert [d.name for d in copc.header.point_format.extra_dimensions] == ["sigma_m", "n_images"]
+
+
+@pytest.mark.parametrize("write", [write_surface_points, write_surface_copc])
+def test_in_a_local_frame_there_is_no_crs(tmp_path, write):
     written(tmp_path, rows=9, crs=local_frame().to_wkt())
-    write_surface_points(tmp_path, tmp_path / "surface.laz")
+    write(tmp_path, tmp_path / "surface.laz")
     assert laspy.read(tmp_path / "surface.laz").header.parse_crs() is None
 
 
-def test_a_surface_without_heights(tmp_path):
+@pytest.mark.parametrize("write", [write_surface_points, write_surface_copc])
+def test_a_surface_without_heights(tmp_path, write):
     grid = GeoBox((4, 5), Affine(CELL_M, 0, WEST, 0, -CELL_M, NORTH), "EPSG:32632")
     nothing = np.full((4, 5), np.nan, np.float32)
     for name in ("dsm.tif", "sigma.tif"):
         write_cog(tmp_path / name, nothing, grid, nodata=np.nan)
     write_cog(tmp_path / "views.tif", np.zeros((4, 5), np.uint8), grid, nodata=0)
     write_cog(tmp_path / "ortho.tif", np.zeros((4, 5), np.uint16), grid, mask=np.zeros((4, 5), bool))
-    assert write_surface_points(tmp_path, tmp_path / "surface.laz") == 0
+    assert write(tmp_path, tmp_path / "surface.laz") == 0
     assert len(laspy.read(tmp_path / "surface.laz").points) == 0
     check_laz(tmp_path / "surface.laz")
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("write", [write_surface_points, write_surface_copc])
+def test_what_cannot_be_written_leaves_nothing(tmp_path, write):
     written(tmp_path, rows=4, cell_m=600000.0)
     with pytest.raises(OutputError, match=r"further apart than 2147 km"):
-        write_surface_points(tmp_path, tmp_path / "surface.laz")
+        write(tmp_path, tmp_path / "surface.laz")
     (tmp_path / "views.tif").unlink()
     with pytest.raises(InputError, match=r"There is no raster .*views\.tif"):
-        write_surface_points(tmp_path, tmp_path / "surface.laz")
+        write(tmp_path, tmp_path / "surface.laz")
     written(tmp_path, rows=4)
     (tmp_path / "surface.laz").mkdir()
     with pytest.raises(OutputError, match=r"surface\.laz cannot be written"):
-        write_surface_points(tmp_path, tmp_path / "surface.laz")
+        write(tmp_path, tmp_path / "surface.laz")
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "dsm.tif", "ortho.tif", "sigma.tif", "surface.laz", "views.tif",
     ]  # fmt: skip

@@ -54,6 +54,12 @@ class CloudOptions:
     fill: Annotated[
         str, typer.Option(help="Fill gaps of the height maps.", metavar="none|interpolate", rich_help_panel=RESULT)
     ] = "none"
+    copc: Annotated[
+        bool,
+        typer.Option(
+            "--copc", help="Also write the points as COPC (cloud.copc.laz), for viewers.", rich_help_panel=RESULT
+        ),
+    ] = False
     partial: Partial = False
     workers: Workers = 1
     memory: Memory = None
@@ -70,7 +76,7 @@ def cloud(options: CloudOptions, console: Console) -> Answer:
         inputs=tuple(options.inputs), out=options.out, references=tuple(options.reference or ()), crs=options.crs,
         bounds=options.bounds, area=options.area, heights=options.heights, vertical=options.vertical,
         fill=options.fill, partial=options.partial, workers=options.workers, memory_gb=options.memory,
-        overwrite=options.overwrite, resume=options.resume,
+        overwrite=options.overwrite, resume=options.resume, copc=options.copc,
     )  # fmt: skip
     check_output(request.out, request.overwrite, may_be_same=True)
     config = config_of(options.config, options.settings)

@@ -38,7 +38,7 @@ METHODS_OF_SELECTION = {
     "default": ("mvll-sgm", "mvll", "gc3-sgm"), "guided": ("mvll-sgm", "mvll"), "paper": ("mvll", "gc3"),
 }  # fmt: skip
 FILLS = ("none", "interpolate", "dem")
-PRODUCTS = ("hillshade", "contours", "dtm", "laz")
+PRODUCTS = ("hillshade", "contours", "dtm", "laz", "copc")
 # The hillshade is what everyone looks at first and takes a second per million cells; the others are made on request.
 DEFAULT_PRODUCTS = ("hillshade",)
 EARTHS = ("curved", "flat")
@@ -208,7 +208,8 @@ class CloudRequest:
 
     inputs, crs, bounds, area, heights, vertical, partial, workers, memory_gb, overwrite, resume : as in `DsmRequest`;
     the cloud of an area has the points whose place on the ground lies in it. references : names of the views whose
-    pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights.
+    pixels get heights; none named means all. fill : of the height maps; the cloud has no filled heights. copc : whether
+    the cloud is written as COPC, too.
 
     Raises
     ------
@@ -232,6 +233,7 @@ class CloudRequest:
     area: Path | None = None
     memory_gb: float | None = None
     resume: bool = True
+    copc: bool = False
 
     def __post_init__(self) -> None:
         check_inputs(self.inputs)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,14 @@ from zlocus.pipeline.execution.plan import keep_at_most
 from zlocus.pipeline.execution.precompile import kernels_compiling
 from zlocus.pipeline.execution.spill_arrays import SpillArrays
 from zlocus.pipeline.fingerprint import COMMANDS, digest_of_images, kernels_of_package
-from zlocus.pipeline.finished_record import checksum, is_map_of_image, read_finished, write_finished
+from zlocus.pipeline.finished_record import (
+    CLOUD_COPC,
+    checksum,
+    is_map_of_image,
+    read_finished,
+    update_finished,
+    write_finished,
+)
 from zlocus.pipeline.finished_run import files_gone
 from zlocus.pipeline.image_scenes import (
     GroundArea,
@@ -69,7 +76,7 @@ from zlocus.pipeline.run_plan import (
     timed_stages,
 )
 from zlocus.pipeline.tile_run import MatchMethod
-from zlocus.products.point_cloud import PointCloud, file_names
+from zlocus.products.point_cloud import PointCloud, file_names, write_cloud_copc
 from zlocus.sensors.image_rays import DepthRays
 
 # A cloud with heights for a smaller share of the pixels seen by two images is no success.
@@ -135,6 +142,8 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     finished = _already_finished(request, run, progress)
     if finished is not None:
         return finished
+    if run.finished is not None and CLOUD_COPC in run.finished.checksums:  # made again with the rest
+        request = replace(request, copc=True)
     is_compiled, is_whole = CACHE.is_complete, not run.checkpoint.finished
     prepared_cloud = oriented_cloud(request, config, run, watch, progress)
     progress.note(str(prepared_cloud.plan))
@@ -156,7 +165,7 @@ def oriented_cloud(
     references = reference_names(scene, request.references)
     if request.bounds is None and request.area is None:
         # All pixels are matched: what has no room is refused before tie points are measured.
-        check_room_for_cloud(request.out, n_pixels_of(scene, references), len(references))
+        check_room_for_cloud(request.out, n_pixels_of(scene, references), len(references), request.copc)
     config = depth_options(config) if is_by_depth(scene) else config
     progress.note(said_before_orientation(scene.views, None))
     with stopwatch.stage("orient"), kernels_compiling(progress):
@@ -191,6 +200,10 @@ def _made(
                 for one, name in zip(matched, file_names(prepared_cloud.references), strict=True):
                     names += write_maps(out, name, one, request.fill, scene.crs, vertical_datum)
                     stage.advance()
+        if request.copc:
+            names.append(CLOUD_COPC)
+            with stopwatch.stage("copc"), progress.stage("COPC"):
+                write_cloud_copc(out)
         coverage = share_with_height(matched, cloud.n_points)
         shortcoming = shortcoming_of(out / CLOUD_FILES[0], coverage, prepared_cloud.setup)
         record = {
@@ -234,7 +247,7 @@ def remove_earlier_cloud(out: Path) -> None:
     """Remove the products of an earlier run, so that old and new products never stand together."""
     earlier = read_finished(out)
     maps = () if earlier is None else (name for name in earlier.checksums if is_map_of_image(name))
-    for name in (*CLOUD_FILES, *maps):
+    for name in (*CLOUD_FILES, CLOUD_COPC, *maps):
         (out / name).unlink(missing_ok=True)
     remove_earlier_products(out, has_incomplete=False)
 
@@ -265,7 +278,7 @@ def prepare_cloud(
         )
     shown = {image_tile.number for image_tile in image_tiles}
     n_pixels = sum(pixels_of(image_scenes[number]).rows * pixels_of(image_scenes[number]).cols for number in shown)
-    check_room_for_cloud(request.out, n_pixels, len(shown))
+    check_room_for_cloud(request.out, n_pixels, len(shown), request.copc)
     scenes = [
         SceneTiles(one.match_scene, [each.tile for each in image_tiles if each.number == number])
         for number, one in enumerate(image_scenes)
@@ -301,14 +314,22 @@ def match_cloud(
 
 
 def _already_finished(request: CloudRequest, run: OpenRun, progress: Progress) -> CloudResult | None:
-    """The result of a run that has finished before; None where there is none, or products of it are missing."""
+    """The result of a run that has finished before; None where there is none, or products of it are missing.
+
+    COPC that is asked for and not there is made from the points.
+    """
     if run.finished is None:
         return None
-    gone = sorted(files_gone(request.out, run.finished, progress))
+    gone = sorted(files_gone(request.out, run.finished, progress) - {CLOUD_COPC})
     if gone:
         progress.note(f"The finished run in {request.out} lacks {', '.join(gone)}: it is made again.")
         return None
     run.checkpoint.remove()  # where a run was stopped between its last file and its end
+    if request.copc and not (request.out / CLOUD_COPC).is_file():
+        with progress.stage("COPC"):
+            write_cloud_copc(request.out)
+        update_finished(request.out, (CLOUD_COPC,))
+        progress.note(f"Made, for it was not there: {CLOUD_COPC}.")
     record = read_record(request.out / RECORD)
     n_points, coverage = int(record["points"]), float(record["coverage"])
     return _accepted(request, CloudResult(request.out, n_points, coverage, True, run.finished.shortcoming))

@@ -32,6 +32,7 @@ WITHOUT_EFFECT = (
     "overwrite",
     "resume",
     "products",
+    "copc",
     "report",
     "inputs",
 )

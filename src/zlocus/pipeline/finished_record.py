@@ -20,7 +20,8 @@ from zlocus.products.stac_item import PRODUCTS
 ITEM = "item.json"
 SCHEMA = 1
 # Products of a cloud, and ends of the names of its maps.
-OF_CLOUD = ("cloud.laz", "cloud.ply", "run.json")
+CLOUD_COPC = "cloud.copc.laz"
+OF_CLOUD = ("cloud.laz", "cloud.ply", CLOUD_COPC, "run.json")
 MAPS_OF_IMAGES = ("_height.tif", "_depth.tif", "_quality.tif")
 # The event log only informs, so it is not checked.
 CHECKED = (*(product.name for product in PRODUCTS if product.name != EVENTS), ITEM)
@@ -95,7 +96,8 @@ def update_finished(out: Path, names: Iterable[str]) -> None:
     found = read_finished(out)
     if found is None or not found.key:
         return
-    made = {name: checksum(out / name) for name in names if name in CHECKED and (out / name).is_file()}
+    known = (*CHECKED, *OF_CLOUD)
+    made = {name: checksum(out / name) for name in names if name in known and (out / name).is_file()}
     _write(out, replace(found, checksums=found.checksums | made))
 
 

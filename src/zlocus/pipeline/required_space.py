@@ -30,6 +30,8 @@ RASTER_CELL_BYTES = 12
 # Bytes of a pixel of a cloud on disk beside its finished tile: the heights and flags of all images, before and after
 # the check across images.
 CLOUD_PIXEL_BYTES = 21
+# Bytes of a point while COPC is written: sorted on disk, and in the file.
+COPC_POINT_BYTES = 47
 # Smaller surfaces are started whatever the space: they take little time, and finished tiles are kept if the disk fills.
 LEAST_REFUSED_BYTES = 1e9
 # Before the tie points are known, a surface is refused only where it needs this many times the free space.
@@ -119,10 +121,11 @@ def n_pixels_of(scene: Scene, names: Sequence[str]) -> int:
     return sum(math.prod(view.image.shape) for view in scene.views if view.name in names)
 
 
-def check_room_for_cloud(out: Path, n_pixels: int, n_images: int) -> None:
+def check_room_for_cloud(out: Path, n_pixels: int, n_images: int, has_copc: bool = False) -> None:
     """Refuse a cloud whose finished tiles and heights the disk of `out` has no room for; memory holds none of them.
 
     n_pixels : to be matched, of n_images reference images. What an earlier run of the same kept needs no more room.
+    has_copc : whether COPC is written, too.
 
     Raises
     ------
@@ -130,7 +133,8 @@ def check_room_for_cloud(out: Path, n_pixels: int, n_images: int) -> None:
         They take more than the disk has free.
     """
     kept = sum(path.stat().st_size for path in (out / FOLDER).glob("*.npz")) if (out / FOLDER).is_dir() else 0
-    needed = float(n_pixels) * (TILE_CELL_BYTES + TILE_BAND_BYTES + CLOUD_PIXEL_BYTES) - kept
+    pixel_bytes = TILE_CELL_BYTES + TILE_BAND_BYTES + CLOUD_PIXEL_BYTES + has_copc * COPC_POINT_BYTES
+    needed = float(n_pixels) * pixel_bytes - kept
     disk = _disk_of(out)
     if needed < LEAST_REFUSED_BYTES or disk is None or needed <= disk.free_bytes:
         return

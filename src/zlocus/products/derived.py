@@ -16,7 +16,10 @@ from zlocus.products.metadata import METADATA, write_metadata
 from zlocus.products.stac_item import write_item
 
 # Files by the names of --products, in the order in which they are made: contours may need the terrain.
-FILES = {"dtm": "dtm.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg", "laz": "surface.laz"}
+FILES = {
+    "dtm": "dtm.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg", "laz": "surface.laz",
+    "copc": "surface.copc.laz",
+}  # fmt: skip
 
 
 def write_derived(folder: Path, names: Collection[str], options: ProductOptions, progress: Progress) -> None:
@@ -105,12 +108,18 @@ def _contours(folder: Path, path: Path, options: ProductOptions) -> None:
 
 
 def _laz(folder: Path, path: Path, options: ProductOptions) -> None:
-    # Only this product needs laspy.
+    # Only this product and the next one need laspy.
     from zlocus.products.surface_points import write_surface_points
 
     write_surface_points(folder, path)
 
 
+def _copc(folder: Path, path: Path, options: ProductOptions) -> None:
+    from zlocus.products.surface_points import write_surface_copc
+
+    write_surface_copc(folder, path)
+
+
 _MAKERS: dict[str, Callable[[Path, Path, ProductOptions], None]] = {
-    "dtm": _dtm, "hillshade": _hillshade, "contours": _contours, "laz": _laz,
+    "dtm": _dtm, "hillshade": _hillshade, "contours": _contours, "laz": _laz, "copc": _copc,
 }  # fmt: skip

@@ -1,16 +1,16 @@
-"""Products of image space: a height map per image, and all points as LAZ and PLY."""
+"""Products of image space: a height map per image, and all points as LAZ, PLY and COPC."""
 
 from __future__ import annotations
 
 import os
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
@@ -25,6 +25,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from zlocus import __version__
 from zlocus.core.errors import OutputError
 from zlocus.core.scene import is_local
+from zlocus.io.points.copc import StepBounds, write_copc
 from zlocus.io.rasters import RasterBands, RasterSink
 
 LAZ_STEP_M = 0.001
@@ -32,6 +33,7 @@ LAZ_STEP_M = 0.001
 SIGMA, VIEWS = "sigma_m", "n_images"
 MAX_LAZ_EXTENT_M = 2**31 * LAZ_STEP_M
 OFFSET_STEP_M = 1000.0
+POINTS_AT_A_TIME = 1_000_000
 PLY_POINT = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)])
 PLY_DIGITS = 19  # of the number of points, at most
 PLY_PROPERTIES = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
@@ -128,6 +130,30 @@ class PointCloud:
     def _failed(self, error: Exception) -> OutputError:
         reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
         return OutputError(f"{self._paths[0]} cannot be written: {reason}. Check the folder and the space left.")
+
+
+def write_cloud_copc(folder: Path) -> int:
+    """Write cloud.copc.laz from the points of cloud.laz in a folder, and return their number.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    path = folder / "cloud.laz"
+
+    def batches() -> Iterator[NDArray[Any]]:
+        with laspy.open(path) as laz:
+            for points in laz.chunk_iterator(POINTS_AT_A_TIME):
+                yield points.array
+
+    with laspy.open(path) as laz:
+        header = laz.header
+    low, high = (
+        np.rint((np.asarray(ends) - header.offsets) / header.scales).astype(np.int64)
+        for ends in (header.mins, header.maxs)
+    )
+    return write_copc(folder / "cloud.copc.laz", header, StepBounds(low, high), batches)
 
 
 def add_precision(header: laspy.LasHeader, of: str) -> None:

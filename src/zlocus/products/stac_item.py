@@ -24,7 +24,7 @@ from zlocus.io.run_record import read_record
 STAC_VERSION, WGS84 = "1.1.0", "EPSG:4326"
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
-HTML, GEOJSON = "text/html", "application/geo+json"
+HTML, GEOJSON, COPC = "text/html", "application/geo+json", "application/vnd.laszip+copc"
 # Each side of the grid is cut into this many pieces, because straight sides on the map are curves in degrees.
 PIECES_PER_SIDE = 16
 # Coordinates are rounded to 1e-7 degrees, a centimetre on the ground.
@@ -54,6 +54,7 @@ PRODUCTS = (
     Product("dtm.tif", "Terrain: the ground without buildings and trees", COG, ("data",)),
     Product("contours.gpkg", "Contours", GEOPACKAGE, ("data",)),
     Product("surface.laz", "The surface's cells as coloured points", LAZ, ("data",)),
+    Product("surface.copc.laz", "The surface's cells as coloured points, in an octree", COPC, ("data",)),
     Product("ties.gpkg", "Tie points", GEOPACKAGE, ("metadata",)),
     Product("observations.npz", "Positions of the tie points in the images", "application/zip", ("metadata",)),
     Product("ranking.gpkg", "How well pairs of images match at the tie points", GEOPACKAGE, ("metadata",)),
