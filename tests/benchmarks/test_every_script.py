@@ -21,6 +21,7 @@ RUN_BY = {
     "bench_orientation.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "rows/other_programs.py": "test_acceptance.py::test_the_rows_of_other_programs_are_those_of_their_last_run",
     "conftest.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
+    "cloud_files.py": "test_speed.py::test_files_of_points_are_compared",
     "coregistration.py": "test_acceptance.py::test_planted_shifts_are_found",
     "displaced_windows.py": "test_ortho_images_row.py::test_a_displaced_ortho_image_is_judged",
     "double_mapping.py": "test_surfaces.py::test_cells_that_show_what_hides_them",

@@ -8,12 +8,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numba
 import numpy as np
 import pytest
 import rasterio
 
 import bench_kernels
+import cloud_files
 import inspecting
 import large
 import machine
@@ -72,6 +74,18 @@ def test_images_of_a_block_show_the_same_ground(repeated_town, tmp_path):
     whole = large.pixels(repeated_town, large.LOOKS[1], 1)
     with rasterio.open(paths[1]) as file:
         np.testing.assert_array_equal(file.read(1)[:, :half], whole[:, half:])
+
+
+def test_files_of_points_are_compared(tmp_path, monkeypatch, capfd):
+    run_script(monkeypatch, cloud_files, "--million", 0.004, "-o", tmp_path)
+    rows = printed_table(capfd.readouterr().out)
+    assert [row["file"] for row in rows] == ["`cloud.laz`", "`cloud.copc.laz`"]
+    for row in rows:
+        assert float(row["s"]) >= 0
+        assert 30 < float(row["MB of memory"]) < 2000
+        assert 1 < float(row["bytes per point"]) < 41
+    one, other = (laspy.read(tmp_path / name).points.array for name in ("cloud.laz", "cloud.copc.laz"))
+    assert sorted(point.tobytes() for point in one) == sorted(point.tobytes() for point in other)
 
 
 def test_growth_is_measured_and_kept(tmp_path, monkeypatch, capfd):
