@@ -1,4 +1,4 @@
-"""item.json: valid by STAC's own schemas, without a network, and true to the files that it links."""
+"""item.json: valid by STAC's own schemas and rules, without a network, and true to the files that it links."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pystac
-import pystac.validation
 import pytest
+import rasterio
 from affine import Affine
 from odc.geo.geobox import GeoBox
-from pyproj import CRS, Transformer
-from shapely.geometry import shape
+from pyproj import CRS
+from pystac.extensions.classification import ClassificationExtension
+from pystac.extensions.projection import ProjectionExtension
+from shapely.geometry import box, shape
 
+from places import ROOT
+from stac_rules import SCHEMAS, check_schemas, validated
 from zlocus.core.errors import InputError
 from zlocus.io.crs import local_frame
-from zlocus.io.open_raster import open_raster
 from zlocus.io.rasters import write_cog
-from zlocus.products.stac_item import PRODUCTS, bands_of, footprint_of, write_item
+from zlocus.matching.quality import Quality
+from zlocus.products.rasters import WaterKind
+from zlocus.products.stac_item import PRODUCTS, bands_of, write_item
 
-# Coordinates are rounded to 1e-7 degrees.
-PLACE_DEG = 1e-7
 CELL_M = 2.0
-SCHEMA = "https://schemas.stacspec.org/v1.1.0/item-spec/json-schema/item.json"
 
 
 @pytest.fixture(autouse=True)
@@ -40,14 +42,14 @@ def grid(west=500000.0, north=4000000.0, crs="EPSG:32632", cell_m=CELL_M, rows=3
     return GeoBox((rows, cols), Affine(cell_m, 0, west, 0, -cell_m, north), crs)
 
 
-def result(folder, box=None, run=None):
+def result(folder, geobox=None, run=None):
     """A folder with a surface of 1 to 1200 m, half of it, an ortho-image and a record."""
-    box = grid() if box is None else box
-    z = np.arange(1.0, 1201.0, dtype=np.float32).reshape(30, 40)
+    geobox = grid() if geobox is None else geobox
+    z = np.arange(1.0, 40.0 * geobox.shape[0] + 1.0, dtype=np.float32).reshape(geobox.shape)
     z[15:] = np.nan
-    write_cog(folder / "dsm.tif", z, box, nodata=np.nan, descriptions=("height",), units="m")
-    rgb = np.repeat(np.arange(1200, dtype=np.uint16).reshape(1, 30, 40), 3, axis=0)
-    write_cog(folder / "ortho.tif", rgb, box, mask=np.isfinite(z), descriptions=("red", "green", "blue"))
+    write_cog(folder / "dsm.tif", z, geobox, nodata=np.nan, descriptions=("height",), units="m")
+    rgb = np.repeat(np.arange(z.size, dtype=np.uint16).reshape(1, *z.shape), 3, axis=0)
+    write_cog(folder / "ortho.tif", rgb, geobox, mask=np.isfinite(z), descriptions=("red", "green", "blue"))
     if run is not None:
         (folder / "run.json").write_text(json.dumps(run))
     return folder
@@ -55,9 +57,7 @@ def result(folder, box=None, run=None):
 
 def item_of(folder):
     assert write_item(folder)
-    item = json.loads((folder / "item.json").read_text())
-    assert pystac.validation.validate_dict(item) == [SCHEMA]
-    return item
+    return validated(json.loads((folder / "item.json").read_text()))
 
 
 RUN = {"created": "2026-05-17T08:09:10+00:00", "image_dates": ["2025-03-04", "2025-02-28", "2025-03-04"]}
@@ -90,6 +90,26 @@ def test_every_file_of_a_result_is_linked(tmp_path):
     assert {asset["href"].removeprefix("./") for asset in item["assets"].values()} == {p.name for p in PRODUCTS}
     assert item["assets"]["contours-gpkg"]["type"] == pystac.MediaType.GEOPACKAGE
     assert item["assets"]["surface-laz"]["type"] == "application/vnd.laszip"
+
+
+def test_the_schemas_of_the_extensions(tmp_path):
+    """An item with all that it may have is valid by them, and one with a wrong field is not."""
+    if SCHEMAS not in os.environ:
+        pytest.skip(f"{SCHEMAS} does not name a folder with the schemas of STAC's extensions: their rules alone count")
+    result(tmp_path, grid(crs=CRS("EPSG:32632+5773").to_wkt()), RUN)
+    for name, dtype in (("quality.tif", np.uint16), ("water.tif", np.uint8)):
+        write_cog(tmp_path / name, np.zeros((30, 40), dtype), grid())
+    item = item_of(tmp_path)
+    assert len(item["stac_extensions"]) == 4
+    for fields, name in (
+        (item["properties"], "proj:code"), (item["assets"]["quality-tif"], "classification:bitfields"),
+        (item["assets"]["dsm-tif"], "raster:spatial_resolution"), (item["assets"]["dsm-tif"], "file:size"),
+    ):  # fmt: skip
+        kept, fields[name] = fields[name], [-1.5]
+        with pytest.raises(pystac.STACValidationError):
+            check_schemas(item)
+        fields[name] = kept
+    check_schemas(item)
 
 
 def test_bands_say_what_the_file_holds(tmp_path):
@@ -138,44 +158,96 @@ def test_without_a_record_the_time_is_that_of_the_surface_file(tmp_path):
     assert item_of(tmp_path)["properties"]["datetime"] == "2024-02-29T12:00:00Z"
 
 
-def footprint(folder, box):
-    """The footprint of a raster on a grid."""
-    write_cog(folder / "flat.tif", np.ones((30, 40), np.uint8), box)
-    with open_raster(folder / "flat.tif", "raster") as file:
-        return footprint_of(file)
+def test_images_with_their_times(tmp_path):
+    """Exact times count as they are, days as whole days; what is known of each image is listed."""
+    taken = {
+        "a": {"date": "2025-03-04", "time": "2025-03-04T10:11:12.500000+00:00", "satellite": "WV03"},
+        "b": {"date": "2025-03-04", "time": "2025-03-04T10:12:13+00:00", "satellite": "WV03"},
+    }
+    run = {"created": RUN["created"], "image_dates": ["2025-03-04"] * 2, "acquisitions": taken}
+    times = item_of(result(tmp_path, run=run))["properties"]
+    assert (times["start_datetime"], times["end_datetime"]) == ("2025-03-04T10:11:12.500000Z", "2025-03-04T10:12:13Z")
+    assert times["platform"] == "WV03"
+    assert times["zlocus:images"] == [
+        {"name": "a", "datetime": "2025-03-04T10:11:12.500000Z", "platform": "WV03"},
+        {"name": "b", "datetime": "2025-03-04T10:12:13Z", "platform": "WV03"},
+    ]
+    taken["b"] = {"date": "2025-03-05", "time": None, "satellite": "PHR1A"}
+    run["image_dates"] = ["2025-03-04", "2025-03-05", None]
+    times = item_of(result(tmp_path, run=run))["properties"]
+    assert (times["start_datetime"], times["end_datetime"]) == ("2025-03-04T10:11:12.500000Z", "2025-03-05T23:59:59Z")
+    assert "platform" not in times
+    assert times["zlocus:images"][1] == {"name": "b", "date": "2025-03-05", "platform": "PHR1A"}
+    assert "The dates of 1 of 3 images are not known." in times["description"]
 
 
-def test_the_footprint_is_the_grid_in_degrees(tmp_path):
-    geometry, bbox = footprint(tmp_path, grid(cell_m=500.0))
-    outline, to_degrees = shape(geometry), Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
-    corners = np.array(to_degrees.transform([500000, 520000, 520000, 500000], [4000000, 4000000, 3985000, 3985000])).T
-    ring = np.array(outline.exterior.coords)
-    for corner in corners:
-        assert np.abs(ring - corner).max(axis=1).min() <= PLACE_DEG
-    assert outline.exterior.is_ccw
-    assert bbox == list(outline.bounds)
-    # The southern side is a curve in degrees: it hangs below the straight line between its corners.
-    assert bbox[1] < corners[:, 1].min() + PLACE_DEG
-    assert outline.is_valid
+def test_the_projection_is_that_of_the_files(tmp_path):
+    item = item_of(result(tmp_path, run=RUN))
+    properties, asset = item["properties"], item["assets"]["dsm-tif"]
+    assert properties["proj:code"] == asset["proj:code"] == "EPSG:32632"
+    # Half of the rows have heights; the outline reaches no further than its simplification.
+    assert shape(properties["proj:geometry"]).bounds == pytest.approx((500000, 3999970, 500080, 4000000), abs=1.0)
+    assert properties["proj:bbox"] == list(shape(properties["proj:geometry"]).bounds)
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        assert asset["proj:shape"] == list(file.shape)
+        assert Affine(*asset["proj:transform"]) == file.transform
+        assert asset["proj:bbox"] == list(file.bounds)
+    assert asset["raster:spatial_resolution"] == CELL_M
+    assert asset["file:size"] == (tmp_path / "dsm.tif").stat().st_size
+    assert "file:size" not in item["assets"]["run-json"]
+    read = pystac.Item.from_file(str(tmp_path / "item.json"))
+    projection = ProjectionExtension.ext(read.assets["ortho-tif"])
+    assert (projection.code, projection.shape) == ("EPSG:32632", [30, 40])
 
 
-def test_a_footprint_across_the_date_line_is_cut(tmp_path):
-    folder = result(tmp_path, grid(820000.0, 200000.0, "EPSG:32660", cell_m=1000.0))
-    item = item_of(folder)
+def test_heights_above_a_geoid_have_their_compound_crs(tmp_path):
+    result(tmp_path, grid(crs=CRS("EPSG:32632+5773").to_wkt()), RUN)
+    (tmp_path / "surface.laz").write_bytes(b"")
+    write_cog(tmp_path / "views.tif", np.ones((30, 40), np.uint8), grid())
+    item = item_of(tmp_path)
+    assert item["properties"]["proj:code"] == item["assets"]["views-tif"]["proj:code"] == "EPSG:32632"
+    for name in ("dsm-tif", "surface-laz"):
+        assert item["assets"][name]["proj:code"] is None
+        assert CRS(item["assets"][name]["proj:wkt2"]) == CRS("EPSG:32632+5773")
+
+
+def test_a_crs_without_a_code_is_written_in_full(tmp_path):
+    crs = CRS("+proj=tmerc +lat_0=47 +lon_0=8.25 +x_0=500000 +y_0=4000000 +ellps=GRS80 +units=m +type=crs")
+    item = item_of(result(tmp_path, grid(crs=crs.to_wkt()), RUN))
+    for fields in (item["properties"], item["assets"]["dsm-tif"]):
+        assert fields["proj:code"] is None
+        assert CRS(fields["proj:wkt2"]).to_2d().equals(CRS.from_wkt(crs.to_wkt()), ignore_axis_order=True)
+
+
+def test_flags_and_water_are_classes(tmp_path):
+    result(tmp_path, run=RUN)
+    write_cog(tmp_path / "quality.tif", np.zeros((30, 40), np.uint16), grid())
+    write_cog(tmp_path / "water.tif", np.zeros((30, 40), np.uint8), grid())
+    assets = item_of(tmp_path)["assets"]
+    found = [
+        (str(1 << each["offset"]), each["name"], each["description"])
+        for each in assets["quality-tif"]["classification:bitfields"]
+    ]
+    page = (ROOT / "docs" / "reference" / "quality.md").read_text(encoding="utf-8")
+    rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in page.splitlines()]
+    assert found == [row[:3] for row in rows if row[0].isdigit()]
+    classes = assets["water-tif"]["classification:classes"]
+    assert [(each["value"], each["name"]) for each in classes] == [(int(kind), kind.name) for kind in WaterKind]
+    (bits,) = (
+        ClassificationExtension.ext(asset).bitfields
+        for key, asset in pystac.Item.from_file(str(tmp_path / "item.json")).assets.items() if key == "quality-tif"
+    )  # fmt: skip
+    value = int(Quality.UNSEEN | Quality.PLANE)
+    is_set = {bit.name for bit in bits if value >> bit.offset & (1 << bit.length) - 1}
+    assert is_set == {"UNSEEN", "PLANE"}
+
+
+def test_the_geometry_is_the_outline_of_the_heights(tmp_path):
+    item = item_of(result(tmp_path, run=RUN))
     west, south, east, north = item["bbox"]
-    assert 179 < west < 180
-    assert -180 < east < -179
-    assert south < north
-    assert item["geometry"]["type"] == "MultiPolygon"
-    first, second = shape(item["geometry"]).geoms
-    assert first.bounds[2] == 180.0
-    assert second.bounds[0] == -180.0
-    # 40 km near the equator
-    assert first.area + second.area == pytest.approx(40 * 30 / 111.3**2, rel=0.01)
-
-
-def test_a_compound_crs_lies_where_its_map_lies(tmp_path):
-    assert footprint(tmp_path, grid(crs=CRS("EPSG:32632+5773").to_wkt())) == footprint(tmp_path, grid())
+    assert shape(item["geometry"]).within(box(west, south, east, north).buffer(1e-9))
+    whole = item_of(result(tmp_path, grid(rows=15), RUN))["bbox"]
+    assert item["bbox"] == pytest.approx(whole, abs=2e-5)
 
 
 @pytest.mark.parametrize("crs", [None, local_frame().to_wkt()])

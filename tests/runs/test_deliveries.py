@@ -15,6 +15,7 @@ from rasterio.enums import ColorInterp
 
 from made_up_deliveries import dimap_delivery, maxar_delivery, shots, write_single, zipped
 from rendered_scenes import read, run
+from stac_rules import validated
 from zlocus.core.options import RunConfig
 from zlocus.core.orient_request import OrientRequest
 from zlocus.core.progress import progress_for
@@ -52,6 +53,11 @@ def test_the_heights_are_those_of_single_files(taken, surface, tmp_path):
     assert [path["path"].rpartition("/")[2] for path in record["inputs"]] == ["d.zip"]
     assert list(record["acquisitions"]) == ["WV03_20141005T160138", "WV03_20141005T160218"]
     assert record["image_dates"] == ["2014-10-05"] * 2
+    properties = validated(json.loads((surface / "item.json").read_text()))["properties"]
+    assert [image["name"] for image in properties["zlocus:images"]] == list(record["acquisitions"])
+    assert [properties["start_datetime"][:19], properties["end_datetime"][:19]] == [
+        "2014-10-05T16:01:38", "2014-10-05T16:02:18",
+    ]  # fmt: skip
 
 
 def test_the_ortho_image_has_the_colours(surface):

@@ -18,9 +18,8 @@ from zlocus.core.requests import DEMO_ACCURACY, EVALUATION_FILES
 from zlocus.core.scene import is_local
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.iso_xml import UNITS, citation, code, document, element, identifier, instant, number, text, typed_date
-from zlocus.io.open_raster import open_raster
 from zlocus.io.run_record import read_record
-from zlocus.products.stac_item import footprint_of
+from zlocus.products.surface_footprint import footprint_of
 
 METADATA, RECORD = "metadata.xml", "run.json"
 NEEDED = (
@@ -80,8 +79,7 @@ def write_metadata(folder: Path) -> bool:
     run = read_record(folder / RECORD) if (folder / RECORD).is_file() else {}
     if any(key not in run for key in NEEDED):  # of an earlier version
         return False
-    with open_raster(folder / "dsm.tif", "raster") as file:
-        bbox = None if is_local(CRS.from_user_input(run["grid"]["crs"])) else footprint_of(file).bbox
+    bbox = None if is_local(CRS.from_user_input(run["grid"]["crs"])) else footprint_of(folder / "dsm.tif").bbox
     content = document(_metadata(run, bbox, _evaluation(folder, run)))
     if (folder / METADATA).is_file() and (folder / METADATA).read_bytes() == content:
         return True

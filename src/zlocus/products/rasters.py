@@ -31,6 +31,14 @@ class WaterKind(IntEnum):
     POSSIBLE = 3  # possible water, or a polygon whose level is not known; the heights are the matched ones
 
 
+WATER_MEANINGS = {
+    WaterKind.LAND: "no water is known",
+    WaterKind.LEVELLED: "water inside a polygon, with the level of its surface",
+    WaterKind.POSSIBLE_LEVELLED: "possible water, with the level of its surface",
+    WaterKind.POSSIBLE: "possible water, or a polygon whose level is not known; the heights are the matched ones",
+}
+
+
 @dataclass(frozen=True)
 class WrittenHeights:
     """height, sigma : (r, c) float32 m, in the vertical datum of the result; quality : (r, c) uint16, see `Quality`;

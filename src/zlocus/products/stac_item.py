@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from rasterio import DatasetReader
-from rasterio.warp import transform_geom
+from pyproj import CRS
 
 from zlocus.core.scene import is_local
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.crs import crs_label
 from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
-from zlocus.io.run_record import read_record
+from zlocus.matching.quality import MEANINGS, Quality
+from zlocus.products.item_times import item_times, rfc3339
+from zlocus.products.rasters import WATER_MEANINGS, WaterKind
+from zlocus.products.surface_footprint import footprint_of
 
-STAC_VERSION, WGS84 = "1.1.0", "EPSG:4326"
+STAC_VERSION = "1.1.0"
+# Extensions by the prefix of their fields.
+EXTENSIONS = {
+    prefix: f"https://stac-extensions.github.io/{name}/schema.json"
+    for prefix, name in (
+        ("proj:", "projection/v2.0.0"), ("classification:", "classification/v2.0.0"), ("raster:", "raster/v2.0.0"),
+        ("file:", "file/v2.1.0"),
+    )
+}  # fmt: skip
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
 HTML, GEOJSON, COPC = "text/html", "application/geo+json", "application/vnd.laszip+copc"
-# Each side of the grid is cut into this many pieces, because straight sides on the map are curves in degrees.
-PIECES_PER_SIDE = 16
-# Coordinates are rounded to 1e-7 degrees, a centimetre on the ground.
-DEGREE_DECIMALS = 7
+# Files whose points have the heights of dsm.tif, and its CRS with its vertical datum.
+WITH_HEIGHTS = (GEOPACKAGE, LAZ, COPC)
 STATISTICS = {"MINIMUM": "minimum", "MAXIMUM": "maximum", "MEAN": "mean", "STDDEV": "stddev",
               "VALID_PERCENT": "valid_percent"}  # fmt: skip
 
@@ -67,19 +72,12 @@ PRODUCTS = (
 )
 
 
-class GridFootprint(NamedTuple):
-    """Outline of a grid on the Earth. geometry : GeoJSON, in degrees; bbox : west, south, east and north, degrees."""
-
-    geometry: dict[str, Any]
-    bbox: list[float]
-
-
 def write_item(folder: Path) -> bool:
     """Write an item that links every product in a folder; return False, and write nothing, in a local frame.
 
-    The item's time is that of the images, as far as `run.json` knows their dates. Otherwise it is that of the run, and
-    the description says so. Rasters are described by the bands of STAC's core. No extension is used, because the
-    schemas of extensions are on the network only; the CRS and the vertical datum are properties with our prefix.
+    Its geometry is the outline of the cells that have a height. The item's time is that of the images, as far as
+    `run.json` knows it. Otherwise it is that of the run, and the description says so. Extensions of STAC describe the
+    grid and CRS of the rasters, the flags of quality.tif and the classes of water.tif, and the sizes of large files.
 
     Raises
     ------
@@ -92,55 +90,85 @@ def write_item(folder: Path) -> bool:
         crs, cell_m, height_description = reader.crs, reader.cell_m, reader.description
     if crs is None or is_local(crs):
         return False
-    with open_raster(folder / "dsm.tif", "raster") as file:
-        footprint = footprint_of(file)
-    times = _times(folder)
+    footprint, times = footprint_of(folder / "dsm.tif"), item_times(folder)
+    assets = {
+        product.name.replace(".", "-"): asset_of(folder, product, crs)
+        for product in PRODUCTS
+        if (folder / product.name).is_file()
+    }
     properties = {
         "title": "Digital surface model", "description": times.description, "gsd": cell_m,
-        "created": _rfc3339(times.created), "zlocus:crs": crs_label(crs), "zlocus:heights": height_description,
+        "created": rfc3339(times.created), **times.properties(), **crs_fields(crs.to_2d()),
+        "proj:geometry": footprint.on_map, "proj:bbox": footprint.map_bbox,
+        "zlocus:crs": crs_label(crs), "zlocus:heights": height_description,
     }  # fmt: skip
-    ends = {"start_datetime": times.first, "end_datetime": times.last}
-    properties |= {name: _rfc3339(end) for name, end in ends.items() if end is not None}
+    used = [
+        address for prefix, address in EXTENSIONS.items()
+        if any(name.startswith(prefix) for fields in (properties, *assets.values()) for name in fields)
+    ]  # fmt: skip
     item = {
-        "type": "Feature", "stac_version": STAC_VERSION, "stac_extensions": [],
+        "type": "Feature", "stac_version": STAC_VERSION, "stac_extensions": used,
         "id": folder.resolve().name or "surface", "geometry": footprint.geometry, "bbox": footprint.bbox,
-        "properties": properties | {"datetime": None if times.single is None else _rfc3339(times.single)},
-        "links": [],
-        "assets": {
-            product.name.replace(".", "-"): asset_of(folder, product)
-            for product in PRODUCTS
-            if (folder / product.name).is_file()
-        },
+        "properties": properties, "links": [], "assets": assets,
     }  # fmt: skip
     text = json.dumps(item, indent=2, allow_nan=False) + "\n"
     write_atomically(folder / "item.json", lambda part: part.write_text(text, encoding="utf-8"))
     return True
 
 
-def asset_of(folder: Path, product: Product) -> dict[str, Any]:
-    """The entry of a product that is in the folder."""
-    bands = {"bands": bands_of(folder / product.name)} if product.media == COG else {}
-    named = {"href": f"./{product.name}", "type": product.media, "title": product.title}
-    return named | bands | {"roles": list(product.roles)}
+def asset_of(folder: Path, product: Product, crs: CRS) -> dict[str, Any]:
+    """The entry of a product that is in the folder. crs : of dsm.tif, with its vertical datum where that is a geoid."""
+    path = folder / product.name
+    asset: dict[str, Any] = {"href": f"./{product.name}", "type": product.media, "title": product.title}
+    if product.media == COG:
+        asset |= {"bands": bands_of(path), **grid_fields(path), **classes_of(product.name)}
+    elif product.media in WITH_HEIGHTS and len(crs.axis_info) > 2:
+        asset |= crs_fields(crs)
+    elif product.media == GEOJSON:
+        asset |= {"proj:code": "OGC:CRS84"}
+    if product.media in (COG, LAZ, COPC):  # other programs change the other files when they open them
+        asset |= {"file:size": path.stat().st_size}
+    return asset | {"roles": list(product.roles)}
 
 
-def footprint_of(file: DatasetReader) -> GridFootprint:
-    """Outline of a raster on the Earth, counter-clockwise.
+def crs_fields(crs: CRS) -> dict[str, Any]:
+    """A CRS by the projection extension: its code, and in full where it has none."""
+    authority = crs.to_authority()
+    if authority is not None:
+        return {"proj:code": ":".join(authority)}
+    return {"proj:code": None, "proj:wkt2": crs.to_wkt()}
 
-    An outline that crosses the date line is cut in two, and its west is larger than its east. Source: RFC 7946, 3.1.6,
-    3.1.9 and 5.2.
-    """
-    west, south, east, north = file.bounds
-    corners = np.array([(west, south), (east, south), (east, north), (west, north), (west, south)])
-    places = np.arange(PIECES_PER_SIDE * (len(corners) - 1) + 1)
-    x, y = (np.interp(places, places[::PIECES_PER_SIDE], column) for column in corners.T)
-    outline = {"type": "Polygon", "coordinates": [list(zip(x, y, strict=True))]}
-    geometry = transform_geom(file.crs, WGS84, outline, precision=DEGREE_DECIMALS)
-    parts = geometry["coordinates"] if geometry["type"] == "MultiPolygon" else [geometry["coordinates"]]
-    low, high = (np.array([end(part[0], axis=0) for part in parts]) for end in (np.min, np.max))
-    # The eastern hemisphere's part has the larger longitudes, and the box begins in it.
-    bbox = (low[:, 0].max(), low[:, 1].min(), high[:, 0].min(), high[:, 1].max())
-    return GridFootprint(geometry, [float(degrees) for degrees in bbox])
+
+def grid_fields(path: Path) -> dict[str, Any]:
+    """The CRS and grid of a raster by the projection extension, and its cell size by the raster extension."""
+    with open_raster(path, "raster") as file:
+        return {
+            **({} if file.crs is None else crs_fields(CRS.from_wkt(file.crs.to_wkt()))),
+            "proj:shape": list(file.shape), "proj:transform": list(file.transform)[:6], "proj:bbox": list(file.bounds),
+            "raster:spatial_resolution": float(file.transform.a),
+        }  # fmt: skip
+
+
+def classes_of(name: str) -> dict[str, Any]:
+    """What the values of a raster mean, by the classification extension. name : of the file."""
+    if name == "water.tif":
+        classes = [
+            {"value": int(kind), "name": kind.name, "description": WATER_MEANINGS[kind]} for kind in WaterKind
+        ]  # fmt: skip
+        return {"classification:classes": classes}
+    if name != "quality.tif":
+        return {}
+    bitfields = [
+        {
+            "offset": int(flag).bit_length() - 1, "length": 1, "name": flag.name, "description": MEANINGS[flag],
+            "classes": [
+                {"value": 0, "name": f"not_{flag.name}", "description": "the flag is not set"},
+                {"value": 1, "name": flag.name, "description": MEANINGS[flag]},
+            ],
+        }
+        for flag in Quality
+    ]  # fmt: skip
+    return {"classification:bitfields": bitfields}
 
 
 def bands_of(path: Path) -> list[dict[str, Any]]:
@@ -164,42 +192,3 @@ def bands_of(path: Path) -> list[dict[str, Any]]:
                 band["unit"] = unit
             bands.append(band | ({"statistics": statistics} if statistics else {}))
     return bands
-
-
-@dataclass(frozen=True)
-class _ItemTimes:
-    """Times of an item. single : the only one, or None where there is a range from first to last; created : of the
-    result; description : of the item, which says where the times are from."""
-
-    single: datetime | None
-    first: datetime | None
-    last: datetime | None
-    created: datetime
-    description: str
-
-
-def _times(folder: Path) -> _ItemTimes:
-    """Times from run.json; without one, the time at which the surface was written."""
-    record: dict[str, Any] = {}
-    if (path := folder / "run.json").is_file():
-        record = read_record(path)
-    if "created" in record:
-        created = datetime.fromisoformat(record["created"])
-    else:
-        created = datetime.fromtimestamp(int((folder / "dsm.tif").stat().st_mtime), UTC)
-    listed: Sequence[str | None] = record.get("image_dates", [])
-    dates = sorted(date.fromisoformat(text) for text in listed if text)
-    description = "Heights from overlapping images, by zlocus."
-    if not dates:
-        description += " The dates of the images are not known: datetime is that of the run."
-        return _ItemTimes(created, None, None, created, description)
-    first = datetime.combine(dates[0], time(0, 0, 0), UTC)
-    last = datetime.combine(dates[-1], time(23, 59, 59), UTC)
-    if len(dates) < len(listed):
-        description += f" The dates of {len(listed) - len(dates)} of {len(listed)} images are not known."
-    return _ItemTimes(None, first, last, created, description)
-
-
-def _rfc3339(when: datetime) -> str:
-    """A time in UTC as RFC 3339 writes it."""
-    return when.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

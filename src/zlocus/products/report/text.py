@@ -12,32 +12,13 @@ from pyproj import CRS, Transformer
 
 from zlocus.core.scene import is_local
 from zlocus.matching.quality import EMPTY, Quality
+from zlocus.matching.quality import MEANINGS as MEANINGS  # one of the texts of the report, too
 from zlocus.products.report.sampling import Survey
 
 if TYPE_CHECKING:
     from zlocus.evaluation.evaluate import Evaluation
     from zlocus.evaluation.statistics import ErrorStatistics
 
-# As docs/reference/quality.md has them; a test keeps them the same.
-MEANINGS = {
-    Quality.OUTSIDE: "outside the area that was asked for, or inside a mask",
-    Quality.UNSEEN: "fewer than two images cover the cell at the ground's height, or agree on a height above it",
-    Quality.OCCLUDED: "fewer than two images see the surface here; in the others it is occluded",
-    Quality.RANGE_END: "the best match is at an end of the height range; the true height may lie beyond it",
-    Quality.NO_MATCH: "the images do not agree at any height, or the heights at the edge of the overlap are noise",
-    Quality.FAILED: "the tile could not be processed",
-    Quality.INCONSISTENT: "the height failed the cross-consistency check with the other images (image space only)",
-    Quality.IMPRECISE: "the standard deviation of the height is larger than checks.max_sigma_m",
-    Quality.WEAK: "the images agree poorly",
-    Quality.AMBIGUOUS: "another height fits nearly as well",
-    Quality.JUMP: "next to a jump in height",
-    Quality.UNREFINED: "uncertain, and without sub-step refinement: the height is that of the semi-global constraint",
-    Quality.FILLED: "no match; the height is interpolated from the neighbours",
-    Quality.DISPUTED: "uncertain, and two groups of image pairs find different heights around the cell",
-    Quality.IMAGE_EXCLUDED: "an image that may show the cell was not used: its mask covers it, or it is too oblique",
-    Quality.PLANE: "without texture of its own; the height is that of a plane fitted to the whole segment",
-    Quality.WATER: "water; the height is the level of its whole surface (the bits FILLED and PLANE together)",
-}
 MASKED_MEANING = "masks leave fewer than two images"
 # Why a cell has no height although its own match curve may have a high peak: see `zlocus.matching.height_checks`.
 DESPITE_PEAK = {
