@@ -63,7 +63,7 @@ def footprint_of(path: Path) -> SurfaceFootprint:
     if factor is None:
         factor = -(-max(rows, cols) // MAX_BLOCKS)
         has_value = _blocks_with_values(path, factor)
-    outline = _outline(has_value, transform @ Affine.scale(factor), box)
+    outline = _outline(has_value, transform * Affine.scale(factor), box)
     long_m = max(outline.bounds[2] - outline.bounds[0], outline.bounds[3] - outline.bounds[1])
     pieces = shapely.segmentize(outline, long_m / PIECES_PER_SIDE)
     degrees = transform_geom(crs, WGS84, shapely.geometry.mapping(pieces), precision=DEGREE_DECIMALS)

@@ -110,7 +110,7 @@ def clouds():
     )  # fmt: skip
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(clouds())
 def test_every_point_is_once_in_the_cube_of_its_node(steps):
     points, header = records(steps)
