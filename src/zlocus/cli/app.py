@@ -29,6 +29,7 @@ from zlocus.cli.doctor import DoctorOptions, doctor
 from zlocus.cli.dsm import DsmOptions, dsm
 from zlocus.cli.evaluate import EvaluateOptions, evaluate
 from zlocus.cli.exit_status import show_our_warnings
+from zlocus.cli.export import ExportOptions, export
 from zlocus.cli.help_text import EXAMPLES, MAX_WIDTH, GroupedHelp, short_help
 from zlocus.cli.import_cameras import ImportOptions, import_cameras
 from zlocus.cli.inspect import InspectOptions, inspect
@@ -59,6 +60,7 @@ COMMANDS: tuple[tuple[str, type[Any], Command[Any]], ...] = (
     ("rank", RankOptions, rank),
     ("doctor", DoctorOptions, doctor),
     ("import", ImportOptions, import_cameras),
+    ("export", ExportOptions, export),
     ("evaluate", EvaluateOptions, evaluate),
     ("align", AlignOptions, align),
     ("compare", CompareOptions, compare),

@@ -45,6 +45,11 @@ EXAMPLES = {
         zlocus import colmap sparse/0 -o scene.yaml --images photos
         zlocus import eo orientations.csv --crs EPSG:32632 --camera camera.yaml
         """,
+    "export": """
+        zlocus export colmap oriented -o for_colmap
+        zlocus export rpc img_1.tif img_2.tif -o copies
+        zlocus export mesh surface -o mesh
+        """,
     "evaluate": """
         zlocus evaluate surface/dsm.tif reference.tif
         zlocus evaluate surface/dsm.tif srtm.tif --geoid egm96 --align -o judged

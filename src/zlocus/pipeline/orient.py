@@ -32,6 +32,7 @@ from zlocus.pipeline.setup import open_inputs, orient_views
 from zlocus.products.corrected_cameras import SCENE, check_cameras_can_be_written, write_cameras
 from zlocus.products.orientation import orientation_record
 from zlocus.products.tie_layers import write_ties
+from zlocus.products.tie_observations import write_observations
 
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
 TERRAIN_PX = 16.0
@@ -77,6 +78,8 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     corrected, checksums = orientation.apply(scene), inputs.record()
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", orientation, corrected)
+        if orientation.refined_ties is not None:
+            write_observations(request.out, orientation.refined_ties)
         record: dict[str, Any] = orientation_record(orientation, scene)
         if of_ortho is not None:
             record["control_ortho"] = of_ortho.found

@@ -19,13 +19,14 @@ from zlocus.core.ortho_request import MOSAIC, MOSAIC_IMAGES, ORTHO_FILES, ORTHO_
 from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.requests import SetupRequest, check_output
 from zlocus.core.resources import cores
-from zlocus.core.scene import View
+from zlocus.core.scene import Scene, View
 from zlocus.io.ground_reference import OrthoReference, open_reference
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, read_record, result_record, write_record
 from zlocus.io.scene_file import open_scene
 from zlocus.io.surface_heights import SurfaceHeights, open_surface
 from zlocus.orientation.ground_match import NoGroundMatch, match_to_ground
+from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.resection import resected
 from zlocus.pipeline.messages import some_names
 from zlocus.pipeline.output_folder import made_folder
@@ -143,20 +144,34 @@ def views_of_run(folder: Path, progress: Progress) -> dict[Path, View]:
     Empty where the run cannot be restored, which is noted.
     """
     try:
-        run = read_record(folder / RECORD)
-        request, config = request_of(folder / RECORD, run), config_of(folder / RECORD, run)
-        opened = open_inputs(SetupRequest.of(request), SilentProgress())
-        ties = read_observations(folder, len(opened.scene.views))
-        if ties is None and run["orientation"].get("n_ties"):
-            raise InputError(f"its observations are missing from {folder}.")
-        orientation = orient_views(opened.scene, config.orientation, SilentProgress(), known_ties=ties)
+        corrected, _ = oriented_run(folder)
     except (ZlocusError, KeyError, AttributeError) as error:
         progress.note(
             f"The cameras of the run in {folder} cannot be restored ({str(error).rstrip('.')}). Its images are treated "
             "like images that took no part in it."
         )
         return {}
-    return {view.path.resolve(): view for view in orientation.apply(opened.scene).views}
+    return {view.path.resolve(): view for view in corrected.views}
+
+
+def oriented_run(folder: Path) -> tuple[Scene, Orientation]:
+    """The scene of the run of a surface in a folder with the cameras that the run gave it, and its orientation.
+
+    Raises
+    ------
+    InputError, ConfigError, GeometryError
+        The run cannot be restored.
+    KeyError, AttributeError
+        Its record is not what a run writes.
+    """
+    run = read_record(folder / RECORD)
+    request, config = request_of(folder / RECORD, run), config_of(folder / RECORD, run)
+    opened = open_inputs(SetupRequest.of(request), SilentProgress())
+    ties = read_observations(folder, len(opened.scene.views))
+    if ties is None and run["orientation"].get("n_ties"):
+        raise InputError(f"its observations are missing from {folder}.")
+    orientation = orient_views(opened.scene, config.orientation, SilentProgress(), known_ties=ties)
+    return orientation.apply(opened.scene), orientation
 
 
 def reference_of(request: OrthoRequest, folder: Path | None, surface: SurfaceHeights) -> OrthoReference | None:

@@ -1,0 +1,216 @@
+"""`zlocus export mesh`: walls look as they do, within two pixels, and files are valid."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from glb_files import read_glb, validator_issues, why_no_validator
+from rendered_scenes import CENTRE
+from wall_scene import ACROSS_DEG, CELL_M, CELLS, GSD_M, HEIGHT_M, write_scene
+from zlocus.core.errors import ConfigError, GeometryError, InputError
+from zlocus.core.export_request import ExportRequest
+from zlocus.core.progress import SilentProgress
+from zlocus.pipeline import export_mesh
+from zlocus.pipeline.export import run_export
+
+# Displacement of a wall's texture from its truth, in pixels of the images.
+MOST_PX = 2.0
+MOST_ON_LINE_PX = 0.5
+WINDOW_TEXELS = 32
+# Values of the texture of what an image shows straight on, less the truth: interpolation, JPEG, and pixels' area.
+TOP_RMS = 12.0
+SAME_M = 1e-3
+
+
+def exported(folder, out, **asked):
+    images = tuple(folder / f"{name}.tif" for name in ACROSS_DEG)
+    request = ExportRequest("mesh", (folder / "dsm.tif", *images), out, **asked)
+    return run_export(request, SilentProgress())
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wall")
+    return folder, write_scene(folder / "scene")
+
+
+@pytest.fixture(scope="module")
+def mesh(scene):
+    folder, _ = scene
+    result = exported(folder / "scene", folder / "mesh")
+    return folder / "mesh", result
+
+
+def meshes(out):
+    record = json.loads((out / "export.json").read_text())
+    return record, [read_glb(out / tile["file"]) for tile in record["tiles"]]
+
+
+def seen_at(read, points):
+    """Texture values (n,) at points of a mesh, barycentric in the triangle that each lies in; NaN outside."""
+    values = np.full(len(points), np.nan)
+    grey = read.texture.mean(axis=2).astype(np.float32)
+    for a, b, c in read.triangles:
+        corners = read.xyz[[a, b, c]]
+        near = np.flatnonzero(
+            ((points >= corners.min(axis=0) - 1e-3) & (points <= corners.max(axis=0) + 1e-3)).all(axis=1)
+        )
+        if not len(near):
+            continue
+        design, wanted = np.vstack([corners.T, np.ones(3)]), np.vstack([points[near].T, np.ones(len(near))])
+        weights, *_ = np.linalg.lstsq(design, wanted, rcond=None)
+        inside = (weights >= -1e-6).all(axis=0)
+        if not inside.any():
+            continue
+        at = ((weights[:, inside].T @ read.uv[[a, b, c]]) * grey.shape[::-1] - 0.5).astype(np.float32)
+        looked_up = cv2.remap(grey, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        values[near[inside]] = looked_up.ravel()
+    return values
+
+
+def facade(out, textures, wall_x):
+    """The wall's texture in the mesh and its truth, (r, c) each, a value per pixel of the images, lowest row first."""
+    along = np.arange(-8.0, 8.0, GSD_M)
+    up = np.arange(0.5, HEIGHT_M - 0.5, GSD_M)
+    y, z = np.meshgrid(along, up)
+    record, (read,) = meshes(out)
+    line = np.ceil(wall_x / CELL_M - 0.5) * CELL_M
+    origin = np.array(record["origin"])
+    points = np.column_stack([np.full(y.size, CENTRE[0] + line), CENTRE[1] + y.ravel(), z.ravel()]) - origin
+    return seen_at(read, points).reshape(y.shape), textures.wall(y, z)
+
+
+def displacements(found, truth):
+    """Displacements of windows of one picture against another, px."""
+    size, shifts = WINDOW_TEXELS, []
+    window = cv2.createHanningWindow((size, size), cv2.CV_32F)
+    for row in range(0, found.shape[0] - size + 1, size // 2):
+        for col in range(0, found.shape[1] - size + 1, size // 2):
+            parts = [np.asarray(each[row : row + size, col : col + size], np.float32) for each in (found, truth)]
+            parts = [part - part.mean() for part in parts]
+            shifts.append(cv2.phaseCorrelate(*parts, window)[0])
+    return np.hypot(*np.array(shifts).T)
+
+
+def test_a_wall_looks_as_it_does(scene, mesh):
+    found, truth = facade(mesh[0], scene[1], 0.0)
+    assert np.isfinite(found).all()
+    away = displacements(found, truth)
+    print(f"largest displacement of a wall on its line: {away.max():.3f} px")
+    assert len(away) > 8
+    assert away.max() < MOST_ON_LINE_PX
+    assert np.corrcoef(found.ravel(), truth.ravel())[0, 1] > 0.9
+
+
+def test_a_wall_beside_its_line_is_within_two_pixels(tmp_path):
+    """A surface places a wall on the line between its cells, up to half a cell from where it stands."""
+    textures = write_scene(tmp_path / "scene", 0.2)
+    exported(tmp_path / "scene", tmp_path / "mesh")
+    away = displacements(*facade(tmp_path / "mesh", textures, 0.2))
+    print(f"largest displacement of a wall beside its line: {away.max():.3f} px")
+    assert away.max() < MOST_PX
+
+
+def test_roof_and_ground_look_as_they_do(scene, mesh):
+    record, (read,) = meshes(mesh[0])
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-12.0, 12.0, 0.5), np.arange(-8.0, 8.0, 0.5)))
+    x += 0.26
+    for is_roof in (True, False):
+        mine = (x < -0.5) if is_roof else (x > 0.5)
+        z = np.full(mine.sum(), HEIGHT_M if is_roof else 0.0)
+        points = np.column_stack([CENTRE[0] + x[mine], CENTRE[1] + y[mine], z]) - np.array(record["origin"])
+        look = scene[1].roof if is_roof else scene[1].ground
+        error = seen_at(read, points) - look(x[mine], y[mine])
+        assert np.sqrt((error**2).mean()) < TOP_RMS
+
+
+def test_what_is_written(mesh):
+    out, result = mesh
+    record, (read,) = meshes(out)
+    assert "1 tiles" in result.text
+    assert record["files"] == ["tile_0_0.glb", "tileset.json"]
+    assert record["cell_m"] == CELL_M
+    assert record["texel_m"] == GSD_M
+    assert record["tiles"][0]["walls"] == CELLS[0]
+    assert record["tiles"][0]["faces_not_seen"] == 0
+    extras = read.document["asset"]["extras"]
+    assert extras["crs"] == "EPSG:32632"
+    assert extras["origin"] == record["origin"]
+    low, high = (end(read.xyz, axis=0) + np.array(record["origin"]) for end in (np.min, np.max))
+    half = np.array([CELLS[1], CELLS[0]]) / 2 * CELL_M
+    np.testing.assert_allclose(low, [*(np.array(CENTRE) - half), 0.0], atol=SAME_M)
+    np.testing.assert_allclose(high, [*(np.array(CENTRE) + half), HEIGHT_M], atol=SAME_M)
+
+
+def test_the_tileset_places_tiles_on_the_earth(mesh):
+    out, _ = mesh
+    record, (read,) = meshes(out)
+    tileset = json.loads((out / "tileset.json").read_text())
+    assert tileset["asset"]["version"] == "1.1"
+    (child,) = tileset["root"]["children"]
+    assert child["content"]["uri"] == "tile_0_0.glb"
+    matrix = np.array(child["transform"]).reshape(4, 4).T
+    placed = (np.column_stack([read.xyz, np.ones(len(read.xyz))]) @ matrix.T)[:, :3]
+    lon, lat = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(
+        *(read.xyz + np.array(record["origin"]))[:, :2].T
+    )
+    height = read.xyz[:, 2] + record["origin"][2]
+    truth = np.column_stack(Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(lon, lat, height))
+    np.testing.assert_allclose(placed, truth, atol=2 * SAME_M)
+    for box, points in ((tileset["root"]["boundingVolume"]["box"], truth), (child["boundingVolume"]["box"], read.xyz)):
+        middle, axes = np.array(box[:3]), np.array(box[3:]).reshape(3, 3)
+        share = np.abs((points - middle) @ axes.T) / (axes**2).sum(axis=1)
+        assert share.max() < 1.0 + 1e-3
+
+
+def test_the_files_are_valid(mesh):
+    why = why_no_validator()
+    if why:
+        pytest.skip(f"npm's gltf-validator cannot be had: {why}")
+    for issues in validator_issues(sorted(mesh[0].glob("*.glb"))):
+        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+def test_tiles_join_without_gaps(scene, mesh, tmp_path, monkeypatch):
+    monkeypatch.setattr(export_mesh, "MAX_TILE_CELLS", 32)
+    exported(scene[0] / "scene", tmp_path / "tiles")
+    record, several = meshes(tmp_path / "tiles")
+    assert len(several) == 4
+    _, (whole,) = meshes(mesh[0])
+
+    def triangles(each):
+        corners = np.round(each.xyz[each.triangles], 3) + 0.0
+        return {tuple(sorted(map(tuple, corner))) for corner in corners.tolist()}
+
+    assert set().union(*map(triangles, several)) == triangles(whole)
+    assert sum(tile["walls"] for tile in record["tiles"]) == CELLS[0]
+
+
+def test_a_part_with_larger_cells(scene, tmp_path):
+    bounds = (CENTRE[0] - 6.0, CENTRE[1] - 4.0, CENTRE[0] + 6.0, CENTRE[1] + 4.0)
+    exported(scene[0] / "scene", tmp_path / "part", bounds=bounds, resolution=1.0)
+    record, (read,) = meshes(tmp_path / "part")
+    size = np.ptp(read.xyz, axis=0)
+    np.testing.assert_allclose(size, [12.0, 8.0, HEIGHT_M], atol=SAME_M)
+    assert record["tiles"][0]["walls"] == 8
+
+
+def test_bad_input_is_refused(scene, tmp_path):
+    folder, out = scene[0] / "scene", tmp_path / "out"
+    request = ExportRequest("mesh", (folder / "dsm.tif", folder / "east.tif"), out)
+    for wrong, error, said in (
+        (replace(request, inputs=(folder / "dsm.tif",)), InputError, "raster without images"),
+        (replace(request, inputs=(folder,)), InputError, "no run.json that tells its images"),
+        (replace(request, inputs=(tmp_path,)), InputError, "holds no dsm.tif"),
+        (replace(request, resolution=0.1), ConfigError, "finer than the surface"),
+        (replace(request, bounds=(0.0, 0.0, 10.0, 10.0)), GeometryError, "no height inside --bounds"),
+    ):
+        with pytest.raises(error, match=said):
+            run_export(wrong, SilentProgress())
+        assert not out.exists()
