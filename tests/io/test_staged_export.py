@@ -31,7 +31,7 @@ def test_files_come_and_the_record_names_them(tmp_path):
 
 
 def test_another_export_replaces_the_earlier_one_and_nothing_else(tmp_path):
-    export(tmp_path, a="1", b__c="2")
+    export(tmp_path, a="1", b__c__d="2")
     (tmp_path / "mine.txt").write_text("mine")
     export(tmp_path, a="3", d="4")
     assert names(tmp_path) == ["a", "d", "export.json", "mine.txt"]

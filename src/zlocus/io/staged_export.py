@@ -75,7 +75,8 @@ def _move(stage: Path, out: Path) -> None:
             raise OutputError(f"{target} exists and is not of an export. Choose another folder with -o.")
     for path in earlier:
         path.unlink(missing_ok=True)
-    for folder in sorted({path.parent for path in earlier if path.parent != out}, reverse=True):
+    folders = {folder for path in earlier for folder in path.relative_to(out).parents} - {Path()}
+    for folder in sorted((out / name for name in folders), reverse=True):
         with suppress(OSError):  # it holds something else, or is gone
             folder.rmdir()
     # The record comes last: where it is, all is there.

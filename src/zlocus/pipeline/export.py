@@ -143,7 +143,10 @@ def local_frame(opened_export: OpenedExport, area: Area | None) -> LocalFrame:
     else:
         ties = opened_export.ties
         points = ties if len(ties) else np.array([_station(view.sensor, scene) for view in scene.views])
-        middle = np.nanmedian(points, axis=0)
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            raise GeometryError("No area is known over which the cameras could be fitted. Give --heights ZMIN ZMAX.")
+        middle = np.median(points, axis=0)
     origin = np.rint(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M
     if any(_is_cartesian(view.sensor) for view in scene.views):
         return LocalFrame.shifted(scene.crs, origin)
