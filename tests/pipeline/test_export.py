@@ -207,7 +207,9 @@ def test_a_rolling_shutter_is_approximated_and_says_so(tmp_path):
     error = record_of(tmp_path / "out")["images"]["ideal"]
     # Half of the motion, 0.124 m, at 480 to 520 m with 350 px.
     assert error["max_px"] == pytest.approx(0.5 * 0.02 * np.hypot(12.0, 3.0) * 350.0 / 480.0, rel=0.1)
-    with pytest.raises(GeometryError, match=r"ideal differs .* more than 0\.05 px, as do 1 others.*--max-error"):
+    with pytest.raises(
+        GeometryError, match=r"ideal differs .* more than 0\.05 px, as do 1 more of 2 images.*--max-error"
+    ):
         export("colmap", inputs, tmp_path / "no", **asked, max_error=0.05)
     with pytest.raises(GeometryError, match="No area is known over which brown could be fitted"):
         export("colmap", inputs, tmp_path / "no", points=False)
@@ -359,7 +361,7 @@ def test_wrong_input_leaves_nothing(images, tmp_path):
     (tmp_path / "run" / "run.json").write_text("{}")
     for kind, inputs, options, error, said in (
         ("colmap", paths, asked | {"bounds": far}, GeometryError, "None of the images .* shows the area"),
-        ("nerf", paths, asked | {"max_error": 1e-6}, GeometryError, "more than 1e-06 px, as do 2 others of 3 images"),
+        ("nerf", paths, asked | {"max_error": 1e-6}, GeometryError, "more than 1e-06 px, as do 2 more of 3 images"),
         ("colmap", paths, {"points": False}, GeometryError, "No area is known"),
         ("asp", local, {}, ConfigError, "frame is local"),
         ("asp", on_map, {}, InputError, "has a frame camera"),

@@ -9,14 +9,14 @@ from pyproj import CRS
 from zlocus.core.errors import GeometryError
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.sensors.local_frame import LocalFrame
-from zlocus.sensors.perspective_fit import ImagePart, fit_perspective, without_skew
-from zlocus.synthetic.cameras import SatelliteCamera
+from zlocus.sensors.perspective_fit import PixelPart, fit_perspective, without_skew
+from zlocus.synthetic.cameras import LineScanner, SatelliteCamera
 
 UTM = CRS.from_epsg(32632)
 GROUND = np.array([462_000.0, 5_247_000.0, 400.0])
 FRAME = LocalFrame.shifted(UTM, GROUND)
 HEIGHTS = (380.0, 460.0)
-PART = ImagePart(120, 80, 700, 500)
+PART = PixelPart(120, 80, 700, 500)
 EXACT_PX = 1e-3
 
 
@@ -50,6 +50,21 @@ def test_the_error_of_a_satellite_is_what_it_says(angles):
     assert np.sqrt((away**2).mean()) == pytest.approx(fit.fit_error.rms_px, rel=0.3)
     assert fit.fit_error.max_px < 0.1
     assert fit.sensor.centre[2] > 1e5
+
+
+@pytest.mark.parametrize("wobble_rows", [6000.0, 900.0])
+def test_an_unsteady_line_scanner_is_no_perspective_view_and_that_is_said(wobble_rows):
+    sensor = LineScanner(
+        (462_000.0, 5_246_000.0, 2440.0), (300.0, 5000.0), 1.0, 26.0, 0.208,
+        wobble_m=0.5, wobble_deg=0.03, wobble_rows=wobble_rows,
+    )  # fmt: skip
+    frame = LocalFrame.shifted(UTM, sensor.ground_from_image(np.array([[470.0, 330.0]]), np.array([420.0]))[0])
+    fit = fit_perspective(sensor, frame, PART, HEIGHTS)
+    xy = np.random.default_rng(3).uniform((PART.col, PART.row), (PART.col + PART.cols, PART.row + PART.rows), (4000, 2))
+    xyz = sensor.ground_from_image(xy, np.random.default_rng(4).uniform(*HEIGHTS, len(xy)))
+    away = np.hypot(*(fit.sensor.image_from_ground(frame.local_from_ground(xyz)) - xy).T)
+    assert away.max() <= 1.05 * fit.fit_error.max_px
+    assert fit.fit_error.max_px > 1.0
 
 
 def test_without_skew_pixels_show_the_same_ground():

@@ -351,6 +351,7 @@ LAID_OUT = {
     "docs/how-to/deliveries.md": lay_out_deliveries,
     "docs/how-to/doctor.md": lay_out_images,
     "docs/how-to/evaluate.md": lay_out_points,
+    "docs/how-to/export.md": lay_out_images,
     "docs/how-to/import.md": lay_out_cameras,
     "docs/how-to/inspect.md": lay_out_images,
     "docs/how-to/large.md": lay_out_images,

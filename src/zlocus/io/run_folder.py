@@ -18,6 +18,7 @@ OTHER_RESULTS = {
     "cloud.ply": ("a point cloud", "zlocus cloud"),
     "point.json": ("match curves of one point", "zlocus curves"),
     "ranking.json": ("a ranking of images", "zlocus rank"),
+    "export.json": ("an export", "zlocus export"),
     "orientation.json": ("tie points and corrected cameras", "zlocus orient` or `zlocus ties"),
     "evaluation.json": ("an evaluation", "zlocus evaluate"),
     "compare.html": ("a comparison", "zlocus compare"),

@@ -23,7 +23,7 @@ from zlocus.pipeline.export_views import OpenedExport, area_of_export, open_expo
 from zlocus.pipeline.messages import some_names
 from zlocus.products import colmap_model, nerf_transforms
 from zlocus.products.adjust_files import PREFIX, adjust_file_name, write_adjust
-from zlocus.products.exported_images import FOLDER, Area, ExportedView, exported_view, write_image
+from zlocus.products.exported_images import FOLDER, ExportArea, ExportedView, exported_view, write_image
 from zlocus.products.exported_points import ExportedPoints, exported_points
 from zlocus.products.point_cloud import file_names
 from zlocus.products.rpc_copies import write_rpc_copy
@@ -32,7 +32,7 @@ from zlocus.sensors.earth_frame import FRAME_SPACE
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.line_shifts import StraightenedImage
 from zlocus.sensors.local_frame import LocalFrame
-from zlocus.sensors.perspective_fit import FitError, ImagePart
+from zlocus.sensors.perspective_fit import FitError, PixelPart
 from zlocus.sensors.rigid_adjustment import fit_adjustment
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 from zlocus.sensors.rpc_fit import GRID_HEIGHTS, GRID_POINTS, fit_rpc
@@ -129,7 +129,7 @@ def _perspective_text(
     return "\n".join(lines)
 
 
-def local_frame(opened_export: OpenedExport, area: Area | None) -> LocalFrame:
+def local_frame(opened_export: OpenedExport, area: ExportArea | None) -> LocalFrame:
     """The axes of an export: east, north and up over the curved Earth, or those of the scene where it is Cartesian.
 
     A local frame keeps its coordinates. The origin on a map is the middle of the area, in whole metres.
@@ -167,7 +167,7 @@ def _station(sensor: SensorModel, scene: Scene) -> Any:
     return sensor.space.ground_from_cartesian(np.array([sensor.centre]))[0]
 
 
-def check_errors(fits: dict[str, FitError | None], request: ExportRequest, what: str) -> None:
+def check_errors(fit_errors: dict[str, FitError | None], request: ExportRequest, what: str) -> None:
     """Refuse cameras that are farther from their sensor model than is asked for.
 
     Raises
@@ -175,22 +175,23 @@ def check_errors(fits: dict[str, FitError | None], request: ExportRequest, what:
     GeometryError
         The error of a view exceeds the limit.
     """
-    known = {name: fit for name, fit in fits.items() if fit is not None}
+    known = {name: fit for name, fit in fit_errors.items() if fit is not None}
     bad = {name: fit for name, fit in known.items() if not fit.max_px <= request.max_error_px}
     if not bad:
         return
     worst = max(bad, key=lambda name: bad[name].max_px)
-    fit, smaller = bad[worst], "a smaller --bounds or narrower --heights" if request.kind in ("colmap", "nerf") else ""
-    advice = f"Give {smaller}, or accept it with" if smaller else "Accept it with"
+    fit, n_others = bad[worst], len(bad) - 1
+    others = f", as do {n_others} more of {len(fit_errors)} images" if n_others else ""
+    is_of_area = request.kind in ("colmap", "nerf")
+    advice = "Give a smaller --bounds or narrower --heights, or accept it" if is_of_area else "Accept it"
     raise GeometryError(
         f"The {what} of {worst} differs from its sensor model by up to {fit.max_px:.2f} px (RMS {fit.rms_px:.2f} px), "
-        f"more than {request.max_error_px:g} px, as do {len(bad) - 1} others of {len(fits)} images. {advice} "
-        "--max-error PX."
+        f"more than {request.max_error_px:g} px{others}. {advice} with --max-error PX."
     )
 
 
-def _errors_text(fits: Sequence[FitError], what: str) -> str:
-    worst, rms = max(fit.max_px for fit in fits), np.sqrt(np.mean([fit.rms_px**2 for fit in fits]))
+def _errors_text(fit_errors: Sequence[FitError], what: str) -> str:
+    worst, rms = max(fit.max_px for fit in fit_errors), np.sqrt(np.mean([fit.rms_px**2 for fit in fit_errors]))
     return f"{what} by {worst:.3f} px at most, {rms:.3f} px RMS."
 
 
@@ -211,12 +212,15 @@ def _export_rpcs(request: ExportRequest, progress: Progress) -> tuple[str, dict[
             "They stay in the pixels."
         )
     if request.kind == "rpc":
-        fits, text = _write_copies(request, scene, names, record, progress), "corrected RPC in their tags"
+        fit_errors, text = _write_copies(request, scene, names, record, progress), "corrected RPC in their tags"
     else:
-        fits, text = _write_adjustments(request, scene, record), f"adjustments for --bundle-adjust-prefix {PREFIX}"
+        fit_errors, text = (
+            _write_adjustments(request, scene, record),
+            f"adjustments for --bundle-adjust-prefix {PREFIX}",
+        )
     lines = [f"{request.out}: {len(scene.views)} images, {text}."]
-    if fits:
-        lines.append(_errors_text(fits, "They differ from the corrected sensor models"))
+    if fit_errors:
+        lines.append(_errors_text(fit_errors, "They differ from the corrected sensor models"))
     return "\n".join(lines), record
 
 
@@ -260,7 +264,7 @@ def corrected_rpc(view: View, scene: Scene, heights: tuple[float, float] | None)
     if z_range is None:
         raise ConfigError(f"No heights are known over which {view.name} could be fitted. Give --heights ZMIN ZMAX.")
     rpc = fit_rpc(view.sensor, view.image.shape, scene.crs, z_range).rpc
-    at = ImagePart(0, 0, view.image.shape[1], view.image.shape[0]).grid(2 * GRID_POINTS)
+    at = PixelPart(0, 0, view.image.shape[1], view.image.shape[0]).grid(2 * GRID_POINTS)
     xy = np.tile(at, (GRID_HEIGHTS + 1, 1))
     xyz = view.sensor.ground_from_image(xy, np.repeat(np.linspace(*z_range, GRID_HEIGHTS + 1), len(at)))
     return rpc, FitError.of(RpcModel(rpc, scene.crs).image_from_ground(xyz) - xy)
@@ -277,11 +281,11 @@ def _write_adjustments(request: ExportRequest, scene: Scene, record: dict[str, A
         delivered = RpcModel(read_rpc(view.path), scene.crs)
         heights = request.heights or scene.heights or delivered.height_bounds()
         adjustments[view.name] = fit_adjustment(delivered, view.sensor, view.image.shape, scene.crs, heights)
-    fits = {name: each.fit_error for name, each in adjustments.items()}
+    fit_errors = {name: each.fit_error for name, each in adjustments.items()}
     files = [adjust_file_name(view.path) for view in scene.views]
     if len(set(files)) < len(files):
         raise InputError("Two images have the same name in different folders, and Ames Stereo Pipeline goes by names.")
-    check_errors(dict(fits), request, "adjusted RPC")
+    check_errors(dict(fit_errors), request, "adjusted RPC")
     with staged_export(request.out) as stage:
         for view, file in zip(scene.views, files, strict=True):
             each = adjustments[view.name]
@@ -291,4 +295,4 @@ def _write_adjustments(request: ExportRequest, scene: Scene, record: dict[str, A
                 "turn_rad": each.turn.tolist(), **each.fit_error.as_dict(),
             }  # fmt: skip
         write_export_record(stage, record)
-    return list(fits.values())
+    return list(fit_errors.values())

@@ -74,7 +74,7 @@ def export_mesh(request: ExportRequest, progress: Progress) -> tuple[str, dict[s
     with progress.stage("Opening images"):
         surface, views = _opened(request)
     setup = _setup(request, surface, views)
-    written = []
+    tiles = []
     with (
         staged_export(request.out) as stage,
         progress.stage("Mesh", len(setup.tiles)) as counted,
@@ -84,22 +84,22 @@ def export_mesh(request: ExportRequest, progress: Progress) -> tuple[str, dict[s
             tile = _write_tile(stage, setup, row, col)
             counted.advance()
             if tile is not None:
-                written.append(tile)
-        if not written:
+                tiles.append(tile)
+        if not tiles:
             raise GeometryError(f"{surface.path} has no height inside --bounds. Check them.")
-        write_tileset(stage / TILESET, written, setup.origin, surface.crs, _size(written))
+        write_tileset(stage / TILESET, tiles, setup.origin, surface.crs, _size(tiles))
         record = {
             "format": request.kind, "request": request_as_dict(request), "surface": str(surface.path),
             "crs": None if is_local(surface.crs) else surface.crs.to_string(), "heights": _heights_of(surface),
             "origin": setup.origin.tolist(), "axes": "x east, y up, z south, from the origin", "jump_m": setup.jump_m,
             "cell_m": float(setup.geobox.transform.a), "texel_m": float(setup.geobox.transform.a) / setup.per_cell,
-            "tiles": [tile.as_dict() for tile in written],
+            "tiles": [tile.as_dict() for tile in tiles],
         }  # fmt: skip
         write_export_record(stage, record)
-    n_triangles, n_walls = sum(tile.n_triangles for tile in written), sum(tile.n_walls for tile in written)
-    n_unseen = sum(tile.n_unseen for tile in written)
+    n_triangles, n_walls = sum(tile.n_triangles for tile in tiles), sum(tile.n_walls for tile in tiles)
+    n_unseen = sum(tile.n_unseen for tile in tiles)
     text = (
-        f"{request.out / TILESET}: {len(written)} tiles, {n_triangles} triangles, {n_walls} walls; {n_unseen} "
+        f"{request.out / TILESET}: {len(tiles)} tiles, {n_triangles} triangles, {n_walls} walls; {n_unseen} "
         f"faces that no image shows are grey. Origin: see {request.out / EXPORT_RECORD}."
     )
     return text, record
@@ -273,7 +273,7 @@ def _wall_uv(walls: Walls, layout: TextureLayout) -> Any:
     return np.stack([uv[..., 0], bottom + share * (top - bottom)], axis=-1).reshape(-1, 2)
 
 
-def _size(written: Sequence[MeshTile]) -> float:
+def _size(tiles: Sequence[MeshTile]) -> float:
     """Size of the whole mesh, m."""
-    low = np.min([tile.low for tile in written], axis=0)
-    return float(np.linalg.norm(np.max([tile.high for tile in written], axis=0) - low))
+    low = np.min([tile.low for tile in tiles], axis=0)
+    return float(np.linalg.norm(np.max([tile.high for tile in tiles], axis=0) - low))

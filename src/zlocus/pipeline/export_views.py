@@ -23,7 +23,7 @@ from zlocus.orientation.tie_heights import supported
 from zlocus.pipeline.ortho import SURFACE, oriented_run
 from zlocus.pipeline.setup import orient_views, requested_crs, sorted_views
 from zlocus.products.corrected_cameras import SCENE
-from zlocus.products.exported_images import Area
+from zlocus.products.exported_images import ExportArea
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.tie_observations import read_observations
 
@@ -98,7 +98,7 @@ def _with_ties(scene: Scene, folder: Path | None, progress: Progress) -> Orienta
     return orient_views(scene, replace(OrientationOptions(), model="none"), progress, known_ties=known)
 
 
-def area_of_export(request: ExportRequest, opened_export: OpenedExport) -> Area | None:
+def area_of_export(request: ExportRequest, opened_export: OpenedExport) -> ExportArea | None:
     """The ground to be exported; None where nothing tells it, as for frame cameras in a local frame without ties."""
     heights = request.heights or opened_export.scene.heights or _heights_of_ties(opened_export)
     if heights is None:
@@ -114,7 +114,7 @@ def area_of_export(request: ExportRequest, opened_export: OpenedExport) -> Area 
         if is_local(scene.crs) and len(ties):
             low, high = ties[:, :2].min(axis=0), ties[:, :2].max(axis=0)
             bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return Area(bounds, heights)
+    return ExportArea(bounds, heights)
 
 
 def _heights_of_ties(opened_export: OpenedExport) -> tuple[float, float] | None:

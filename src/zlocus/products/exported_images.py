@@ -33,7 +33,7 @@ from zlocus.sensors.perspective_fit import (
     GRID_HEIGHTS,
     GRID_POINTS,
     FitError,
-    ImagePart,
+    PixelPart,
     correspondences,
     fit_perspective,
     without_skew,
@@ -53,7 +53,7 @@ BLACK_PERCENT, WHITE_PERCENT, SAMPLED_ROWS = 0.5, 99.5, 32
 
 
 @dataclass(frozen=True)
-class Area:
+class ExportArea:
     """Ground to be exported. bounds : (xmin, ymin, xmax, ymax) m; heights : lowest and highest, ellipsoidal, m."""
 
     bounds: tuple[float, float, float, float]
@@ -113,7 +113,7 @@ class ExportedView:
 
 
 def exported_view(
-    view: View, frame: LocalFrame, area: Area | None, file: str, can_be_said: Callable[[FrameModel], bool]
+    view: View, frame: LocalFrame, area: ExportArea | None, file: str, can_be_said: Callable[[FrameModel], bool]
 ) -> ExportedView | None:
     """A view as other programs see it; None where it shows nothing of the area.
 
@@ -138,7 +138,7 @@ def exported_view(
     if exact.rolling_shutter is not None:
         assert area is not None, "it was checked above"
         plain = replace(exact, rolling_shutter=None)
-        part = ImagePart(0, 0, cols, rows)
+        part = PixelPart(0, 0, cols, rows)
         xy, local = correspondences(view.sensor, frame, part, area.heights, GRID_POINTS, GRID_HEIGHTS)
         fit_error = FitError.of(plain.image_from_ground(local) - xy)
     if not can_be_said(plain):
@@ -161,7 +161,7 @@ def frame_camera(sensor: SensorModel, frame: LocalFrame) -> FrameModel | None:
     return None if local is None else local.moved(column, row)
 
 
-def _fitted_view(view: View, frame: LocalFrame, area: Area, file: str) -> ExportedView | None:
+def _fitted_view(view: View, frame: LocalFrame, area: ExportArea, file: str) -> ExportedView | None:
     part = part_of_area(view, area)
     if part is None:
         return None
@@ -173,7 +173,7 @@ def _fitted_view(view: View, frame: LocalFrame, area: Area, file: str) -> Export
     return ExportedView(view, fit.sensor, sensor, shape, fit.fit_error, f"{file}.png", False)
 
 
-def part_of_area(view: View, area: Area) -> ImagePart | None:
+def part_of_area(view: View, area: ExportArea) -> PixelPart | None:
     """The part of an image that may show the area; None where it shows none of it."""
     xy = view.sensor.image_from_ground(area.points)
     xy = xy[np.isfinite(xy).all(axis=1)]
@@ -184,7 +184,7 @@ def part_of_area(view: View, area: Area) -> ImagePart | None:
     high = np.clip(np.ceil(xy.max(axis=0)) + 1 + MARGIN_PX, 0, limits).astype(int)
     if (high - low < 2 * MARGIN_PX).any():
         return None
-    return ImagePart(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+    return PixelPart(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
 def is_plain(image: ImageSource) -> bool:

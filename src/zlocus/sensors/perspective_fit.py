@@ -58,7 +58,7 @@ class PerspectiveFit:
 
 
 @dataclass(frozen=True)
-class ImagePart:
+class PixelPart:
     """A part of an image. The first column and row, and how many there are."""
 
     col: int
@@ -74,7 +74,7 @@ class ImagePart:
 
 
 def fit_perspective(
-    sensor: SensorModel, frame: LocalFrame, part: ImagePart, heights: tuple[float, float]
+    sensor: SensorModel, frame: LocalFrame, part: PixelPart, heights: tuple[float, float]
 ) -> PerspectiveFit:
     """Fit a perspective camera with skew to a sensor over a part of its image and a range of heights (m).
 
@@ -93,7 +93,7 @@ def fit_perspective(
 
 
 def correspondences(
-    sensor: SensorModel, frame: LocalFrame, part: ImagePart, heights: tuple[float, float], per_side: int, n_heights: int
+    sensor: SensorModel, frame: LocalFrame, part: PixelPart, heights: tuple[float, float], per_side: int, n_heights: int
 ) -> tuple[FloatArray, FloatArray]:
     """Image positions (n, 2) px over a part of an image and, in local axes, the points (n, 3) m that they show at some
     heights (m)."""
@@ -103,7 +103,7 @@ def correspondences(
     return xy, frame.local_from_ground(ground)
 
 
-def without_skew(sensor: FrameModel, part: ImagePart) -> tuple[FrameModel, tuple[int, int]]:
+def without_skew(sensor: FrameModel, part: PixelPart) -> tuple[FrameModel, tuple[int, int]]:
     """A camera without skew that shows the pixels of a part of an image, and the rows and columns of its image.
 
     Rows of its image are those of the part, each shifted so that skew is gone.

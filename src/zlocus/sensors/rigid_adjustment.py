@@ -16,7 +16,7 @@ from pyproj import CRS
 from zlocus.core.errors import GeometryError
 from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.sensors.earth_frame import WGS84, WGS84_EARTH, between
-from zlocus.sensors.perspective_fit import FitError, ImagePart
+from zlocus.sensors.perspective_fit import FitError, PixelPart
 from zlocus.sensors.rpc import RpcModel
 
 # Points along each side of the image, and heights, of the fit. It is judged at twice as many.
@@ -52,7 +52,7 @@ class RigidAdjustment:
 
 
 def fit_adjustment(
-    delivered: RpcModel, corrected: SensorModel, shape: tuple[int, int], crs: CRS, heights: tuple[float, float]
+    rpc_model: RpcModel, corrected_sensor: SensorModel, shape: tuple[int, int], crs: CRS, heights: tuple[float, float]
 ) -> RigidAdjustment:
     """The adjustment of a delivered RPC that comes nearest to a corrected sensor model.
 
@@ -63,23 +63,23 @@ def fit_adjustment(
     GeometryError
         A model does not map all of the image.
     """
-    part = ImagePart(0, 0, shape[1], shape[0])
-    xy, ground = _seen(corrected, part, crs, heights, GRID_POINTS, GRID_HEIGHTS)
+    part = PixelPart(0, 0, shape[1], shape[0])
+    xy, ground = _seen(corrected_sensor, part, crs, heights, GRID_POINTS, GRID_HEIGHTS)
     if not np.isfinite(ground).all():
         raise GeometryError("The sensor model does not map all of the image. Give other --heights.")
-    centre, parameters = _centre(delivered), np.zeros(6)
+    centre, parameters = _centre(rpc_model), np.zeros(6)
     for _ in range(STEPS):
-        away = (xy - _projected(delivered, moved_points(ground, centre, parameters))).ravel()
+        away = (xy - _projected(rpc_model, moved_points(ground, centre, parameters))).ravel()
         jacobian = np.empty((len(away), 6))
         for k, step in enumerate(np.diag([STEP_M] * 3 + [STEP_M / LEVER_M] * 3)):
             ahead, behind = (
-                _projected(delivered, moved_points(ground, centre, parameters + sign * step)) for sign in (1.0, -1.0)
+                _projected(rpc_model, moved_points(ground, centre, parameters + sign * step)) for sign in (1.0, -1.0)
             )
             jacobian[:, k] = (ahead - behind).ravel() / (2.0 * STEP_M)
         added = np.linalg.lstsq(jacobian, away, rcond=MIN_SHARE)[0]
         parameters = parameters + added / np.array([1.0] * 3 + [LEVER_M] * 3)
-    xy, ground = _seen(corrected, part, crs, heights, 2 * GRID_POINTS, GRID_HEIGHTS + 1)
-    fit_error = FitError.of(_projected(delivered, moved_points(ground, centre, parameters)) - xy)
+    xy, ground = _seen(corrected_sensor, part, crs, heights, 2 * GRID_POINTS, GRID_HEIGHTS + 1)
+    fit_error = FitError.of(_projected(rpc_model, moved_points(ground, centre, parameters)) - xy)
     return RigidAdjustment(parameters[:3], parameters[3:], centre, fit_error)
 
 
@@ -93,7 +93,7 @@ def moved_points(ground: FloatArray, centre: FloatArray, parameters: FloatArray)
 
 
 def _seen(
-    sensor: SensorModel, part: ImagePart, crs: CRS, heights: tuple[float, float], per_side: int, n_heights: int
+    sensor: SensorModel, part: PixelPart, crs: CRS, heights: tuple[float, float], per_side: int, n_heights: int
 ) -> tuple[FloatArray, FloatArray]:
     """Image positions (n, 2) px, and the geocentric points (n, 3) m that they show."""
     at = part.grid(per_side)
@@ -103,16 +103,16 @@ def _seen(
     return xy, WGS84_EARTH.cartesian_from_ground(np.column_stack([lon, lat, xyz[:, 2]]))
 
 
-def _projected(delivered: RpcModel, ground: FloatArray) -> FloatArray:
+def _projected(rpc_model: RpcModel, ground: FloatArray) -> FloatArray:
     """Image positions (n, 2) px of geocentric points (n, 3) m."""
     lon, lat, height = WGS84_EARTH.geographic_from_cartesian(ground).T
-    return delivered.image_from_geographic(lon, lat, height)
+    return rpc_model.image_from_geographic(lon, lat, height)
 
 
-def _centre(delivered: RpcModel) -> FloatArray:
+def _centre(rpc_model: RpcModel) -> FloatArray:
     """The geocentric point (3,) m about which the camera of an RPC is turned."""
-    rpc = delivered.rpc
+    rpc = rpc_model.rpc
     up = min(max(CENTRE_SHARE * rpc.height_scale, MIN_CENTRE_M), MAX_CENTRE_M)
     height = np.array([rpc.height_off + up])
-    lon, lat = delivered.geographic_from_image(np.zeros((1, 2)), height)
+    lon, lat = rpc_model.geographic_from_image(np.zeros((1, 2)), height)
     return np.asarray(WGS84_EARTH.cartesian_from_ground(np.column_stack([lon, lat, height]))[0])
