@@ -13,8 +13,8 @@ from zlocus.synthetic.files import write_image
 
 HEIGHT_M, GSD_M, CELL_M = 20.0, 0.25, 0.5
 # Cells of the surface; the wall stands in their middle, and its outer side looks to the east.
-CELLS = (40, 60)
-IMAGE = (220, 300)
+CELLS = (28, 56)
+IMAGE = (120, 260)
 # Angles to the side from which the satellites look: two from the east, one from the west, one from above.
 ACROSS_DEG = {"east": -32.0, "far_east": -45.0, "above": -2.0, "west": 25.0}
 # Texels of the textures, m.
@@ -44,7 +44,7 @@ class Textures:
 
 
 def camera(name):
-    return SatelliteCamera((*CENTRE, 5.0), (149.5, 109.5), GSD_M, 3.0, ACROSS_DEG[name])
+    return SatelliteCamera((*CENTRE, 5.0), (129.5, 59.5), GSD_M, 3.0, ACROSS_DEG[name])
 
 
 def rendered(name, wall_x, textures, samples=2):
