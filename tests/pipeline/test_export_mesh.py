@@ -172,25 +172,24 @@ def test_what_is_written(mesh):
     np.testing.assert_allclose(high, [*(np.array(CENTRE) + half), HEIGHT_M], atol=SAME_M)
 
 
-def test_the_tileset_places_tiles_on_the_earth(mesh):
-    out, _ = mesh
-    record, (read,) = meshes(out)
+def check_tileset(out):
+    """Tiles lie on the Earth where the map has them, and inside the boxes of the tileset."""
+    record, reads = meshes(out)
     tileset = json.loads((out / "tileset.json").read_text())
     assert tileset["asset"]["version"] == "1.1"
-    (child,) = tileset["root"]["children"]
-    assert child["content"]["uri"] == "tile_0_0.glb"
-    matrix = np.array(child["transform"]).reshape(4, 4).T
-    placed = (np.column_stack([read.xyz, np.ones(len(read.xyz))]) @ matrix.T)[:, :3]
-    lon, lat = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(
-        *(read.xyz + np.array(record["origin"]))[:, :2].T
-    )
-    height = read.xyz[:, 2] + record["origin"][2]
-    truth = np.column_stack(Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(lon, lat, height))
-    np.testing.assert_allclose(placed, truth, atol=2 * SAME_M)
-    for box, points in ((tileset["root"]["boundingVolume"]["box"], truth), (child["boundingVolume"]["box"], read.xyz)):
-        middle, axes = np.array(box[:3]), np.array(box[3:]).reshape(3, 3)
-        share = np.abs((points - middle) @ axes.T) / (axes**2).sum(axis=1)
-        assert share.max() < 1.0 + 1e-3
+    to_geographic = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    to_geocentric = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    for tile, child, read in zip(record["tiles"], tileset["root"]["children"], reads, strict=True):
+        assert child["content"]["uri"] == tile["file"]
+        matrix = np.array(child["transform"]).reshape(4, 4).T
+        placed = (np.column_stack([read.xyz, np.ones(len(read.xyz))]) @ matrix.T)[:, :3]
+        on_map = read.xyz + np.array(record["origin"])
+        truth = np.column_stack(to_geocentric.transform(*to_geographic.transform(*on_map[:, :2].T), on_map[:, 2]))
+        np.testing.assert_allclose(placed, truth, atol=SAME_M)
+        for volume, points in ((tileset["root"], truth), (child, read.xyz)):
+            box = volume["boundingVolume"]["box"]
+            middle, axes = np.array(box[:3]), np.array(box[3:]).reshape(3, 3)
+            assert (np.abs((points - middle) @ axes.T) / (axes**2).sum(axis=1)).max() < 1.0 + 1e-3
 
 
 def test_the_files_are_valid(mesh):
@@ -205,6 +204,7 @@ def test_tiles_join_without_gaps(scene, mesh, tmp_path, monkeypatch):
     monkeypatch.setattr(export_mesh, "MIN_TILE_CELLS", 16)
     monkeypatch.setattr(export_mesh, "MAX_TILE_CELLS", 16)
     exported(scene[0] / "scene", tmp_path / "tiles")
+    check_tileset(tmp_path / "tiles")
     record, several = meshes(tmp_path / "tiles")
     assert len(several) == 8
     _, (whole,) = meshes(mesh[0])

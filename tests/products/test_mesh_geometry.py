@@ -55,6 +55,16 @@ def test_a_step_has_a_wall_on_the_line_between_the_cells(turn, outwards):
     np.testing.assert_allclose(normal, np.broadcast_to([10.0 * outwards[0], -10.0 * outwards[1], 0.0], (6, 3)))
 
 
+@pytest.mark.parametrize("turn", range(4))
+def test_cells_that_hang_together_around_a_corner_share_it(turn):
+    """Three cells rise by less than a jump from one to the next, the fourth is a tower."""
+    z = np.rot90(np.array([[0.0, 0.9], [10.0, 1.8]]), turn)
+    patches, walls = surface_mesh(around(z), JUMP_M)
+    middle = patches.outlines[(patches.outlines[..., :2] == 1.0).all(axis=-1)]
+    np.testing.assert_allclose(np.sort(middle[:, 2]), [0.9, 0.9, 0.9, 10.0])
+    assert len(walls) == 2
+
+
 def edges(outlines):
     """How often each edge of outlines (k, 4, 3) with a length occurs, counted by its direction."""
     counts = Counter()

@@ -22,6 +22,8 @@ from zlocus.sensors.earth_frame import EarthSpace
 TILESET = "tileset.json"
 # Distance over which the scale of a map is measured, m.
 STEP_M = 10.0
+# Sides of boxes are at least so long, also of a level tile, m.
+MIN_SIDE_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,8 @@ def geocentric_from_local(crs: CRS, origin: FloatArray, at: FloatArray) -> Float
 
 
 def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """A box as its middle and half of its axes."""
-    return [*((low + high) / 2).tolist(), *np.diag((high - low) / 2).ravel().tolist()]
+    """A box as its middle and half of its axes, none of which is 0."""
+    return [*((low + high) / 2).tolist(), *np.diag(np.maximum(high - low, MIN_SIDE_M) / 2).ravel().tolist()]
 
 
 def _geocentric_box(crs: CRS, origin: FloatArray, low: FloatArray, high: FloatArray) -> list[float]:
