@@ -12,8 +12,8 @@ import rasterio
 from pyproj import Transformer
 
 from glb_files import read_glb, validator_issues, why_no_validator
-from rendered_scenes import CENTRE
-from wall_scene import ACROSS_DEG, CELL_M, CELLS, GSD_M, HEIGHT_M, write_scene
+from rendered_scenes import CENTRE, UTM
+from wall_scene import ACROSS_DEG, CELL_M, CELLS, GSD_M, HEIGHT_M, IMAGE, camera, write_scene
 from zlocus.core.errors import ConfigError, GeometryError, InputError
 from zlocus.core.export_request import ExportRequest
 from zlocus.core.options import RunConfig
@@ -22,6 +22,8 @@ from zlocus.core.requests import DsmRequest
 from zlocus.pipeline import export_mesh
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.export import run_export
+from zlocus.sensors.rpc_fit import fit_rpc
+from zlocus.synthetic.files import write_image
 
 # Displacement of a wall's texture from its truth, in pixels of the images.
 MOST_PX = 2.0
@@ -224,6 +226,25 @@ def test_a_part_with_larger_cells(scene, tmp_path):
     size = np.ptp(read.xyz, axis=0)
     np.testing.assert_allclose(size, [12.0, 8.0, HEIGHT_M], atol=SAME_M)
     assert record["tiles"][0]["walls"] == 8
+
+
+def test_a_tile_that_no_image_shows_is_grey(scene, tmp_path, monkeypatch):
+    """And images that do not show a tile are not looked at."""
+    monkeypatch.setattr(export_mesh, "MIN_TILE_CELLS", 16)
+    monkeypatch.setattr(export_mesh, "MAX_TILE_CELLS", 16)
+    sensor = replace(camera("above"), target=(CENTRE[0] - 40.0, CENTRE[1], 5.0))  # its image ends before the wall
+    pixels = np.random.default_rng(3).integers(190, 211, IMAGE).astype(np.uint8)
+    write_image(tmp_path / "beside.tif", pixels, fit_rpc(sensor, IMAGE, UTM, (-20.0, 60.0)).rpc)
+    request = ExportRequest("mesh", (scene[0] / "scene" / "dsm.tif", tmp_path / "beside.tif"), tmp_path / "out")
+    run_export(request, SilentProgress())
+    record, reads = meshes(tmp_path / "out")
+    shown = [read.texture[: read.texture.shape[0] // 2].mean() > 150 for read in reads]
+    assert any(shown)
+    assert not all(shown)
+    for tile, read, is_shown in zip(record["tiles"], reads, shown, strict=True):
+        if not is_shown:
+            assert tile["faces_not_seen"] >= len(read.triangles) // 2
+            assert read.texture.mean() == pytest.approx(128.0, abs=1.0)
 
 
 def test_bad_input_is_refused(scene, tmp_path):

@@ -16,7 +16,7 @@ from zlocus.core.requests import check_output
 from zlocus.core.scene import Scene, View, is_local
 from zlocus.core.sensor_model import SensorModel, bare
 from zlocus.io.cameras.rpc import read_rpc
-from zlocus.io.run_record import request_as_dict
+from zlocus.io.run_record import request_as_dict, versions_record
 from zlocus.io.staged_export import staged_export, write_export_record
 from zlocus.pipeline.export_mesh import export_mesh
 from zlocus.pipeline.export_views import OpenedExport, area_of_export, open_export
@@ -39,6 +39,8 @@ from zlocus.sensors.rpc_fit import GRID_HEIGHTS, GRID_POINTS, fit_rpc
 
 # The origin of a local frame is rounded to whole metres.
 ORIGIN_STEP_M = 1.0
+# Entries of the record that the answer of the command leaves out.
+OF_RECORD = ("request", "versions")
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def run_export(request: ExportRequest, progress: Progress) -> ExportResult:
         text, record = _export_rpcs(request, progress)
     else:
         text, record = _export_perspective(request, progress)
-    return ExportResult(text, {name: value for name, value in record.items() if name != "request"})
+    return ExportResult(text, {name: value for name, value in record.items() if name not in OF_RECORD})
 
 
 def _export_perspective(request: ExportRequest, progress: Progress) -> tuple[str, dict[str, Any]]:
@@ -196,7 +198,7 @@ def _errors_text(fit_errors: Sequence[FitError], what: str) -> str:
 
 
 def _record(request: ExportRequest) -> dict[str, Any]:
-    return {"format": request.kind, "request": request_as_dict(request)}
+    return {"format": request.kind, "request": request_as_dict(request), "versions": versions_record()}
 
 
 def _export_rpcs(request: ExportRequest, progress: Progress) -> tuple[str, dict[str, Any]]:

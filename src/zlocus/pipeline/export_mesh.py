@@ -16,7 +16,7 @@ from zlocus.core.footprints import Bounds, ground_sample_distance
 from zlocus.core.progress import Progress
 from zlocus.core.request_checks import check_inputs
 from zlocus.core.scene import View, is_local
-from zlocus.io.run_record import request_as_dict
+from zlocus.io.run_record import request_as_dict, versions_record
 from zlocus.io.scene_file import open_scene
 from zlocus.io.staged_export import staged_export, write_export_record
 from zlocus.io.surface_heights import SurfaceHeights, open_surface
@@ -38,6 +38,8 @@ MAX_TEXELS_PER_CELL = 8
 # Neighbours that differ by more cells than this have a wall between them.
 JUMP_CELLS = 2.0
 ORIGIN_STEP_M = 1.0
+# Points along each side of a tile that are projected to find the images that may show it.
+BOX_POINTS = 9
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,8 @@ def export_mesh(request: ExportRequest, progress: Progress) -> tuple[str, dict[s
             raise GeometryError(f"{surface.path} has no height inside --bounds. Check them.")
         write_tileset(stage / TILESET, tiles, setup.origin, surface.crs, _size(tiles))
         record = {
-            "format": request.kind, "request": request_as_dict(request), "surface": str(surface.path),
+            "format": request.kind, "request": request_as_dict(request), "versions": versions_record(),
+            "surface": str(surface.path),
             "crs": None if is_local(surface.crs) else surface.crs.to_string(), "heights": _heights_of(surface),
             "origin": setup.origin.tolist(), "axes": "x east, y up, z south, from the origin", "jump_m": setup.jump_m,
             "cell_m": float(setup.geobox.transform.a), "texel_m": float(setup.geobox.transform.a) / setup.per_cell,
@@ -169,7 +172,7 @@ def _write_tile(stage: Path, setup: MeshSetup, row: int, col: int) -> MeshTile |
         transform * transform.translation(col, row),
     )  # fmt: skip
     layout = TextureLayout.of((rows, cols), walls, setup.per_cell, window.cell_m)
-    texture = mesh_texture(setup.images, patches, walls, layout, window)
+    texture = mesh_texture(_images_near(setup, patches, window), patches, walls, layout, window)
     mesh = _mesh(patches, walls, layout, window, setup)
     textured_mesh = TexturedMesh(*mesh[:3], texture.values, mesh[3])
     name = f"tile_{row // setup.side}_{col // setup.side}"
@@ -219,6 +222,20 @@ def _read_around(setup: MeshSetup, row: int, col: int, rows: int, cols: int) -> 
     cells = np.sort(heights.reshape(rows, n, cols, n).transpose(0, 2, 1, 3).reshape(rows, cols, n * n), axis=-1)
     middle = np.maximum(np.isfinite(cells).sum(axis=-1) - 1, 0) // 2
     return np.take_along_axis(cells, middle[..., None], axis=-1)[..., 0]
+
+
+def _images_near(setup: MeshSetup, patches: CellPatches, window: SurfaceWindow) -> list[TextureImage]:
+    """The images that may show a tile, so that memory does not grow with the number of all images."""
+    low, high = (end(patches.outlines, axis=(0, 1)) for end in (np.min, np.max))
+    axes = [np.linspace(start, stop, n) for start, stop, n in zip(low, high, (BOX_POINTS, BOX_POINTS, 2), strict=True)]
+    points = window.ground(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    near = []
+    for image in setup.images:
+        xy = image.sensor.image_from_ground(points)
+        xy = xy[np.isfinite(xy).all(axis=1)]
+        if len(xy) and (xy.max(axis=0) >= 0).all() and (xy.min(axis=0) < image.bands.shape[::-1]).all():
+            near.append(image)
+    return near
 
 
 def _margin(setup: MeshSetup, around: Any) -> int:

@@ -144,7 +144,7 @@ def best_image(
     (k, 2) of walls.
     """
     best, area = np.full(len(outlines), -1), np.zeros(len(outlines))
-    if not len(outlines):
+    if not (len(outlines) and images):
         return best
     shown = np.stack([_pixels(image, outlines, window) for image in images])
     # Neighbouring faces should show the same image: those that show most of the tile come first.
