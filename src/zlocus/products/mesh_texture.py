@@ -19,10 +19,12 @@ from zlocus.sensors.ground_sampling import sampled
 MAX_TEXTURE_ROWS = 8192
 # Texels around each wall, so that interpolation at its edges takes from the wall itself.
 GUTTER = 1
-# Heights along a wall, as shares of it, at which it is found out whether an image sees it.
-WALL_SHARES = (0.25, 0.5, 0.75)
-# An image is preferred to one that shows more of the tile where it shows a face on so many times its pixels.
-MIN_GAIN = 1.5
+# Parts of a wall, one above the other, of which each gets an image that sees its middle: what stands before a wall
+# hides its foot.
+WALL_PARTS = 4
+# An image is preferred to one that shows more of the tile where it shows a face on so many times its pixels. Walls that
+# run askew are stairs, whose steps face two sides and should still show one image.
+MIN_GAIN, MIN_GAIN_OF_WALL = 1.5, 3.0
 # Points whose values are looked up side by side.
 ROW_OF_POINTS = 256
 # Value of faces that no image shows.
@@ -64,7 +66,7 @@ class TextureLayout:
             wall_rows = np.maximum(np.ceil(height / texel_m - 1e-9), 1).astype(np.int64)
             shelves = wall_rows[order][::per_row] + 2 * GUTTER
             total = rows + GUTTER + int(shelves.sum())
-            if total <= MAX_TEXTURE_ROWS:
+            if total <= MAX_TEXTURE_ROWS or (wall_rows == 1).all():
                 break
             texel_m *= 2
         top = rows + GUTTER + np.concatenate([[0], np.cumsum(shelves)])
@@ -110,7 +112,9 @@ def mesh_texture(
         An image can no longer be read.
     """
     best_patch = best_image(images, patches.outlines, _patch_samples(patches), None, window)
-    best_wall = best_image(images, walls.outlines, _wall_samples(walls), walls.outwards, window)
+    of_parts = (np.repeat(each, WALL_PARTS, axis=0) for each in (walls.outlines, walls.outwards))
+    outlines, outwards = of_parts
+    best_wall = best_image(images, outlines, _wall_samples(walls), outwards, window).reshape(-1, WALL_PARTS)
     points, owner = _texels(patches, best_patch, walls, best_wall, layout)
     values = np.full((*layout.shape, 3), GREY, np.uint8)
     for number, image in enumerate(images):
@@ -126,7 +130,7 @@ def mesh_texture(
         scaled = stored((found.values - low) * (255.0 / (high - low)), np.dtype(np.uint8))
         shown = mine & found.valid
         values[shown] = np.broadcast_to(np.moveaxis(scaled, 0, -1), (*layout.shape, scaled.shape[0]))[shown]
-    return MeshTexture(values, int((best_patch < 0).sum()), int((best_wall < 0).sum()))
+    return MeshTexture(values, int((best_patch < 0).sum()), int((best_wall < 0).all(axis=1).sum()))
 
 
 def best_image(
@@ -148,8 +152,9 @@ def best_image(
         return best
     shown = np.stack([_pixels(image, outlines, window) for image in images])
     # Neighbouring faces should show the same image: those that show most of the tile come first.
+    gain = MIN_GAIN if outwards is None else MIN_GAIN_OF_WALL
     for number in np.argsort(-shown.sum(axis=1), kind="stable"):
-        wanted = np.flatnonzero(shown[number] > MIN_GAIN * area)
+        wanted = np.flatnonzero(shown[number] > gain * area)
         chosen = None if outwards is None else outwards[wanted]
         wanted = wanted[is_seen(images[number].sensor, samples[wanted], chosen, window)]
         wanted = wanted[_has_value(images[number], samples[wanted].mean(axis=1), window)]
@@ -187,9 +192,10 @@ def _patch_samples(patches: CellPatches) -> FloatArray:
 
 
 def _wall_samples(walls: Walls) -> FloatArray:
-    """Points (k, 3, 3) along the middle line of each wall."""
+    """The middle of each part of each wall, (k * parts, 1, 3), the lowest part of a wall first."""
     low, high = walls.outlines[:, :2].mean(axis=1), walls.outlines[:, 2:].mean(axis=1)
-    return np.stack([low + share * (high - low) for share in WALL_SHARES], axis=1)
+    shares = (np.arange(WALL_PARTS) + 0.5) / WALL_PARTS
+    return np.asarray((low[:, None] + shares[:, None] * (high - low)[:, None]).reshape(-1, 1, 3))
 
 
 def _texels(
@@ -197,7 +203,7 @@ def _texels(
     layout: TextureLayout,
 ) -> tuple[FloatArray, NDArray[np.int64]]:  # fmt: skip
     """The point (r, c, 3) of the surface that each texel shows, in cells and m, and the image (r, c) that it is taken
-    from; -1 where there is none."""
+    from; -1 where there is none. best_patch : (k,), best_wall : (k, parts) images."""
     n = layout.per_cell
     points, owner = np.zeros((*layout.shape, 3)), np.full(layout.shape, -1)
     share = (np.arange(n) + 0.5) / n
@@ -220,5 +226,6 @@ def _texels(
         to_row = (layout.first[mine, 1, None] + np.arange(-GUTTER, wall_rows + GUTTER))[:, :, None]
         to_col = (layout.first[mine, 0, None] + np.arange(-GUTTER, n + GUTTER))[:, None, :]
         points[to_row, to_col] = grid
-        owner[to_row, to_col] = best_wall[mine, None, None]
+        part = np.clip(np.floor(up * WALL_PARTS), 0, WALL_PARTS - 1).astype(np.int64)
+        owner[to_row, to_col] = best_wall[mine][:, part][:, :, None]
     return points, owner
