@@ -27,6 +27,7 @@ from zlocus.io.scene_file import open_scene
 from zlocus.orientation import orientation as orientation_module
 from zlocus.pipeline.export import run_export
 from zlocus.pipeline.orient import run_orient
+from zlocus.products import exported_images
 from zlocus.products.adjust_files import adjust_file_name
 
 SAME_PX, SAME_ON_A_MAP_PX = 1e-6, 1e-4
@@ -199,6 +200,17 @@ def test_nerf_tools_see_what_frame_cameras_see(tmp_path, ground):
         np.testing.assert_allclose(found, picture(*xy[inside].T), atol=SAME_GREY)
 
 
+def test_images_are_resampled_block_by_block(tmp_path, monkeypatch):
+    inputs = frame_scene(tmp_path / "in", ["skewed", "ideal"], *PLACES["local"])
+    pixels = []
+    for block in (exported_images.BLOCK_PX, 64):
+        monkeypatch.setattr(exported_images, "BLOCK_PX", block)
+        export("colmap", inputs, tmp_path / str(block), points=False)
+        pixels.append(cv2.imread(str(tmp_path / str(block) / "images" / "skewed.png"), cv2.IMREAD_UNCHANGED))
+    assert pixels[0].shape == (ROWS, COLS)
+    assert np.abs(pixels[0].astype(int) - pixels[1]).max() <= 1  # rounding
+
+
 def test_a_rolling_shutter_is_approximated_and_says_so(tmp_path):
     motion = {"rolling_shutter": {"readout_s": 0.02, "velocity_m_s": [12.0, 3.0, 0.0]}}
     inputs = frame_scene(tmp_path / "in", ["ideal", "brown"], *PLACES["map"], **motion)
@@ -300,6 +312,12 @@ def test_orient_keeps_its_tie_points_for_an_export(images, tmp_path, monkeypatch
     assert record["points"] > 50
     # The area of the heights of tie points, where no others are given.
     assert 25.0 < record["area"]["heights"][0] < record["area"]["heights"][1] < 80.0
+    # Of a scene file from which a view was taken out, the numbers of the views are no longer those of the tie points.
+    document = yaml.safe_load((oriented / "scene.yaml").read_text())
+    document["views"] = document["views"][1:]
+    (oriented / "scene.yaml").write_text(yaml.safe_dump(document))
+    with pytest.raises(TypeError, match="not callable"):
+        export("colmap", oriented, tmp_path / "other")
 
 
 def shifted_scene(images, folder):

@@ -79,7 +79,7 @@ def test_the_report(oriented):
     assert "3 of 6 directions" in report["unobservable"]
     assert set(report["cameras"]) == set(LOOKS)
     assert sorted(path.name for path in oriented.iterdir()) == [
-        "cameras", "orientation.json", "run.json", "scene.yaml", "ties.gpkg",
+        "cameras", "observations.npz", "orientation.json", "run.json", "scene.yaml", "ties.gpkg",
     ]  # fmt: skip
 
 

@@ -17,9 +17,11 @@ from zlocus.core.request_checks import check_inputs
 from zlocus.core.scene import Scene, is_local
 from zlocus.core.sensor_model import FloatArray
 from zlocus.io.crs import checked_crs
+from zlocus.io.run_record import read_record
 from zlocus.io.scene_file import open_scene
 from zlocus.orientation.orientation import Orientation
 from zlocus.orientation.tie_heights import supported
+from zlocus.pipeline.orient import ORIENTATION
 from zlocus.pipeline.ortho import SURFACE, oriented_run
 from zlocus.pipeline.setup import orient_views, requested_crs, sorted_views
 from zlocus.products.corrected_cameras import SCENE
@@ -94,8 +96,19 @@ def _of_surface(folder: Path, wanted: CRS | None) -> OpenedExport:
 
 def _with_ties(scene: Scene, folder: Path | None, progress: Progress) -> Orientation:
     """The tie points of a scene whose cameras stay as they are: read from a folder that keeps them, or searched."""
-    known = None if folder is None else read_observations(folder, len(scene.views))
+    known = None
+    if folder is not None and _views_of_orientation(folder) == [view.name for view in scene.views]:
+        known = read_observations(folder, len(scene.views))
     return orient_views(scene, replace(OrientationOptions(), model="none"), progress, known_ties=known)
+
+
+def _views_of_orientation(folder: Path) -> list[str]:
+    """Names of the views that `zlocus orient` oriented into a folder, in the order of its ties; none where it does not
+    say."""
+    try:
+        return sorted(read_record(folder / ORIENTATION)["views"])
+    except (ZlocusError, KeyError, TypeError):
+        return []
 
 
 def area_of_export(request: ExportRequest, opened_export: OpenedExport) -> ExportArea | None:

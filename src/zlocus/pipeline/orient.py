@@ -78,14 +78,14 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
     corrected, checksums = orientation.apply(scene), inputs.record()
     with watch.stage("write"), made_folder(request.out):
         write_ties(request.out / "ties.gpkg", orientation, corrected)
-        if orientation.refined_ties is not None:
-            write_observations(request.out, orientation.refined_ties)
         record: dict[str, Any] = orientation_record(orientation, scene)
         if of_ortho is not None:
             record["control_ortho"] = of_ortho.found
             write_control(request.out / CONTROL_POINTS, of_ortho.control, scene.views)
         if request.cameras:
             record["cameras"] = write_cameras(request.out, request.inputs, corrected)
+            if orientation.refined_ties is not None:
+                write_observations(request.out, orientation.refined_ties)
         write_record(request.out / ORIENTATION, record)
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     if not request.cameras:
