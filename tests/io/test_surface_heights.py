@@ -9,6 +9,8 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 
 from zlocus.core.errors import ConfigError, InputError
+from zlocus.core.scene import is_local
+from zlocus.io.crs import local_frame
 from zlocus.io.surface_heights import open_surface
 
 AT = Affine(2.0, 0.0, 462000.0, 0.0, -2.0, 5247000.0)
@@ -47,6 +49,17 @@ def test_windows_hold_the_heights(surface):
     assert np.isfinite(z).all()
     gap = surface.read(GeoBox((10, 10), Affine(2.0, 0.0, AT.c, 0.0, -2.0, AT.f), "EPSG:32632"))
     assert np.isnan(gap).all()
+
+
+def test_a_local_frame_is_taken_where_it_may_be(tmp_path):
+    path = written(tmp_path / "local.tif", np.full((30, 40), 7.0), AT, local_frame().to_wkt())
+    with pytest.raises(InputError, match="cannot be converted to places on the Earth"):
+        open_surface(path)
+    surface = open_surface(path, may_be_local=True)
+    assert is_local(surface.crs)
+    assert (
+        surface.read(GeoBox(surface.shape, surface.transform, surface.crs)).tolist() == np.full((30, 40), 7.0).tolist()
+    )
 
 
 def test_what_is_no_surface_is_refused(tmp_path):

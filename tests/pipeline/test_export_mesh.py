@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import yaml
 from pyproj import Transformer
 
 from glb_files import read_glb, validator_issues, why_no_validator
@@ -19,6 +20,7 @@ from zlocus.core.export_request import ExportRequest
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import DsmRequest
+from zlocus.io.crs import local_frame
 from zlocus.pipeline import export_mesh
 from zlocus.pipeline.dsm import run_dsm
 from zlocus.pipeline.export import run_export
@@ -226,6 +228,31 @@ def test_a_part_with_larger_cells(scene, tmp_path):
     size = np.ptp(read.xyz, axis=0)
     np.testing.assert_allclose(size, [12.0, 8.0, HEIGHT_M], atol=SAME_M)
     assert record["tiles"][0]["walls"] == 8
+
+
+def test_a_mesh_in_a_local_frame(tmp_path):
+    """It lies nowhere on the Earth, and has no transform to it."""
+    z = np.zeros((20, 30), np.float32)
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "height": 20, "width": 30}
+    transform = rasterio.Affine(0.5, 0.0, -7.5, 0.0, -0.5, 5.0)
+    with rasterio.open(tmp_path / "dsm.tif", "w", **profile, crs=local_frame().to_wkt(), transform=transform) as file:
+        file.write(z, 1)
+    views = []
+    for k, name in enumerate("ab"):
+        pixels = np.random.default_rng(k).integers(80, 120, (150, 200)).astype(np.uint8)
+        write_image(tmp_path / f"{name}.tif", pixels, None)
+        frame_camera = {"kind": "frame", "focal": 200.0, "principal_point": [99.5, 74.5], "centre": [k, 0.0, 20.0]}
+        views.append({"name": name, "image": f"{name}.tif", "camera": frame_camera | {"angles": [0.0, 0.0, 0.0]}})
+    scene = {"schema": 1, "frame": {"local": True}, "views": views}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    request = ExportRequest("mesh", (tmp_path / "dsm.tif", tmp_path / "scene.yaml"), tmp_path / "out")
+    run_export(request, SilentProgress())
+    record, (read,) = meshes(tmp_path / "out")
+    assert record["crs"] is None
+    assert record["tiles"][0]["faces_not_seen"] == 0
+    assert read.texture.mean() == pytest.approx(100.0, abs=2.0)
+    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    assert "transform" not in tileset["root"]["children"][0]
 
 
 def test_a_tile_that_no_image_shows_is_grey(scene, tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from zlocus.io.crs import checked_crs, raster_crs
 from zlocus.io.grid_inputs import dem_datum
 from zlocus.io.height_values import check_unit, is_fill
 from zlocus.io.open_raster import cached_raster, open_raster
-from zlocus.io.vertical import VerticalDatum, check_heights
+from zlocus.io.vertical import ELLIPSOIDAL, VerticalDatum, check_heights
 
 # Of so many cells of the raster along each side only the lowest and the greatest height are kept.
 PATCH_CELLS = 256
@@ -92,10 +92,11 @@ class SurfaceHeights:
         return max(float(found.max(initial=-np.inf)), self.z_range[0])
 
 
-def open_surface(path: Path, vertical: str | None = None) -> SurfaceHeights:
+def open_surface(path: Path, vertical: str | None = None, may_be_local: bool = False) -> SurfaceHeights:
     """Open a surface, and read it once, patch by patch, for its greatest heights.
 
-    vertical : vertical datum of its heights, see `dem_datum`; None: the one that its CRS declares.
+    vertical : vertical datum of its heights, see `dem_datum`; None: the one that its CRS declares. may_be_local : a
+    raster in a local frame is taken too.
 
     Raises
     ------
@@ -106,15 +107,17 @@ def open_surface(path: Path, vertical: str | None = None) -> SurfaceHeights:
         not installed.
     """
     with open_raster(path, "surface") as source:
-        crs, transform, shape = raster_crs(source, path), source.transform, source.shape
-        check_heights(crs, path)
+        local = may_be_local and source.crs is not None and is_local(CRS.from_user_input(source.crs))
+        crs = CRS.from_user_input(source.crs) if local else raster_crs(source, path)
+        transform, shape = source.transform, source.shape
+        if not local:
+            check_heights(crs, path)
         check_unit(source.units[0], path)
         t = transform
         if not (t.b == t.d == 0 and t.a > 0 and abs(t.a + t.e) < 1e-6 * t.a):
             raise ConfigError(f"{path} is not north up with square cells. Warp it first: gdalwarp -tr M M.")
-        if not is_local(crs):
-            crs = checked_crs(crs)
-        datum = dem_datum(path, vertical)
+        crs = crs if local else checked_crs(crs)
+        datum = ELLIPSOIDAL if local else dem_datum(path, vertical)
         patches = -(-shape[0] // PATCH_CELLS), -(-shape[1] // PATCH_CELLS)
         highest, lowest, middles = np.full(patches, -np.inf), np.inf, []
         for i, j in np.ndindex(*patches):

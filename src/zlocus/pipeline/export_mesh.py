@@ -112,13 +112,13 @@ def _opened(request: ExportRequest) -> tuple[SurfaceHeights, Sequence[View]]:
     """The surface, and the views with the cameras from which it is textured."""
     first, *others = request.inputs
     if not first.is_dir():
-        surface = open_surface(first)
+        surface = open_surface(first, may_be_local=True)
         if not others:
             raise InputError(f"{first} is a raster without images. Name the images, or a scene.yaml, behind it.")
         return surface, _named_views(tuple(others), surface)
     if not (first / SURFACE).is_file():
         raise InputError(f"{first} holds no {SURFACE}. Give the folder of a surface, or a raster of heights.")
-    surface = open_surface(first / SURFACE)
+    surface = open_surface(first / SURFACE, may_be_local=True)
     if others:
         return surface, _named_views(tuple(others), surface)
     if not (first / RECORD).is_file():
