@@ -33,7 +33,9 @@ def test_a_summary_is_printed_and_a_page_is_written(zl, tmp_path):
     assert "cells with a height: 1200 in both, 0 in A only, 0 in B only" in lines
     assert "B less A: median +0.500 m, NMAD 0.000 m, RMSE 0.500 m, LE90 0.500 m" in lines
     assert lines[-1] == f"{out / 'compare.html'}: open it in a browser."
-    assert sorted(path.name for path in out.iterdir()) == ["compare.html", "difference.tif"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "compare.html", "difference.qml", "difference.sld", "difference.tif",
+    ]  # fmt: skip
     again = zl(first, second, "-o", out)
     assert again.exit_code == 2
     assert "holds another comparison (compare.html, difference.tif)" in again.stderr

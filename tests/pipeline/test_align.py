@@ -19,6 +19,7 @@ from zlocus.core.progress import SilentProgress
 from zlocus.evaluation import fit_sample
 from zlocus.evaluation.height_file import HeightFile
 from zlocus.io.points.ground_points import PointOptions
+from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.pipeline.align import run_align
 from zlocus.products.derived import FILES
 
@@ -71,7 +72,9 @@ def test_a_folder_moves_as_one_and_nothing_is_interpolated(tmp_path, folder):
     result = aligned(folder, table(tmp_path), out)
     assert result.fit.shift_m == pytest.approx(PLANTED, abs=SHIFT_M)
     east, north, up = result.fit.shift_m
-    assert sorted(path.name for path in out.iterdir()) == sorted([*RASTERS, "hillshade.tif", "item.json", "run.json"])
+    rasters = (*RASTERS, "hillshade.tif")
+    styles = [name for raster in rasters if raster in OF_SURFACE for name in style_files(raster)]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*rasters, *styles, "item.json", "run.json"])
     for name in RASTERS:
         values, transform, profile, tags, mask = read(out / name)
         before, was, profile_before, tags_before, mask_before = read(folder / name)

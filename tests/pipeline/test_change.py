@@ -110,6 +110,7 @@ def test_files(changed):
     assert names == {
         "change.json", "difference.tif", "sigma.tif", "significance.tif", "class.tif", "volumes.csv", "volumes.gpkg",
         "change.png",
+        *(f"{name}.{kind}" for name in ("difference", "sigma", "significance", "class") for kind in ("qml", "sld")),
     }  # fmt: skip
     rows = list(csv.DictReader((folder / "out" / "volumes.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["name"] for row in rows] == ["pit 0", "pit 1", "pit 2", "pit 3"]

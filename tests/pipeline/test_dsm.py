@@ -38,11 +38,19 @@ from zlocus.core.progress import progress_for
 from zlocus.core.requests import DsmRequest
 from zlocus.core.resources import held_bytes
 from zlocus.io.cameras.rpc_text import rpc_from_fields
+from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.matching.quality import Quality, is_empty
 
 REPORT_FILES = ("report.html", "footprints.geojson", "curves.json")
 PRODUCTS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 MAPS = ("hillshade.tif", "dtm.tif")
+
+
+def styles_of(products):
+    """Names of the style files of products that have any."""
+    return {name for product in products if product in OF_SURFACE for name in style_files(product)}
+
+
 ALL_MAPS = ("hillshade", "contours", "dtm", "laz")
 # Base-to-height about 0.6 and 0.5 m pixels: 0.05 m of height is 0.06 px.
 BIAS_M, SPREAD_M = 0.02, {"plane": 0.05, "tilt": 0.06, "sine": 0.08, "step": 0.08}
@@ -144,6 +152,7 @@ def test_products(whole, images):
         *PRODUCTS, *MAPS, *REPORT_FILES, "contours.gpkg", "surface.laz", "ties.gpkg", "observations.npz", "run.json",
         "item.json", "metadata.xml", "events.jsonl", "finished.json",
     }  # fmt: skip
+    made |= styles_of(made)
     assert {path.name for path in whole.iterdir()} == made
     quality, views = read(whole / "quality.tif")[0], read(whole / "views.tif")[0]
     np.testing.assert_array_equal(np.isnan(height), is_empty(quality))
@@ -240,7 +249,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
     assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
     run(images("plane"), out, bounds=PART, products=(), overwrite=True, report=True)
-    assert {path.name for path in out.iterdir()} == {
+    assert {path.name for path in out.iterdir()} == styles_of((*PRODUCTS, "ties.gpkg")) | {
         *PRODUCTS,
         *REPORT_FILES,
         "ties.gpkg",

@@ -33,7 +33,7 @@ from zlocus.pipeline.finished_record import checksum
 from zlocus.pipeline.match_curves import run_curves
 from zlocus.pipeline.orient import run_orient
 from zlocus.pipeline.rank import run_rank
-from zlocus.products.stac_item import PRODUCTS
+from zlocus.products.stac_item import PRODUCTS, STYLES
 
 RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
 OF_TIES = ("ties.gpkg", "observations.npz", "footprints.geojson", "curves.json")
@@ -86,9 +86,10 @@ def changed(before, out):
 
 def test_what_is_finished_is_said_and_left_alone(images, out, no_matching):
     before = state(out)
-    assert {product.name for product in PRODUCTS if product.name in before} | {"item.json", FINISHED} == set(before)
+    styles = {style.name for style in STYLES if style.name in before}
+    assert {p.name for p in PRODUCTS if p.name in before} | styles | {"item.json", FINISHED} == set(before)
     listed = json.loads((out / FINISHED).read_text())
-    assert set(listed["products"]) == set(before) - {FINISHED, "events.jsonl"}
+    assert set(listed["products"]) == set(before) - styles - {FINISHED, "events.jsonl"}
     result = asked(images, out)
     assert result.was_finished
     assert result.coverage == pytest.approx(json.loads((out / "run.json").read_text())["coverage"], abs=1e-6)
@@ -121,6 +122,21 @@ def test_a_product_that_is_missing_is_made_again_and_nothing_else(images, out, n
     before = state(out)
     asked(images, out)
     assert changed(before, out) == set()
+
+
+def test_styles_are_made_again_where_they_are_missing_and_stay_where_they_were_changed(images, out, no_matching, said):
+    """QGIS writes the style of a layer, and statistics, beside it: no product has changed then."""
+    own = "<qgis/>"
+    for name in ("dsm.qml", "quality.tif.aux.xml"):
+        (out / name).write_text(own)
+    (out / "sigma.sld").unlink()
+    before = state(out)
+    assert asked(images, out).was_finished
+    assert "Made, for it was not there: sigma.sld." in said.getvalue()
+    assert "sigma.sld" in changed(before, out) <= {"sigma.sld", "item.json", FINISHED}
+    assert (out / "dsm.qml").read_text() == own
+    CliRunner().invoke(app, ["products", str(out), "--products", "hillshade"], catch_exceptions=False)
+    assert (out / "dsm.qml").read_text() == own
 
 
 @pytest.mark.parametrize("names", [("sigma.tif",), ("dsm.tif", "run.json", "report.html"), (*RASTERS, "hillshade.tif")])
@@ -234,7 +250,7 @@ def test_products_that_are_asked_for_later_are_added(images, out, no_matching, s
     with pytest.raises(OutputError, match="contours_of"):
         asked(images, out, config, products=("dtm",))
     assert asked(images, out, products=("dtm", "laz")).was_finished
-    assert changed(before, out) == {"dtm.tif", "surface.laz", "item.json", FINISHED}
+    assert changed(before, out) == {"dtm.tif", "dtm.qml", "dtm.sld", "surface.laz", "item.json", FINISHED}
     assert "Made, for it was not there: dtm.tif, surface.laz." in said.getvalue()
     assert "dtm.tif" in (out / "item.json").read_text()
     before = state(out)

@@ -14,6 +14,7 @@ from overlapping_surfaces import CELL_M, CORNER, two_runs, write_raster, write_r
 from zlocus.core.errors import ConfigError, InputError, OutputError
 from zlocus.core.progress import KeptNotes, SilentProgress
 from zlocus.core.surface_requests import MosaicRequest
+from zlocus.io.styles.file_names import style_files
 from zlocus.matching.quality import Quality
 from zlocus.pipeline.mosaic import run_mosaic
 from zlocus.products.blending import SeamKind
@@ -101,7 +102,9 @@ def test_what_only_one_run_has_seen_is_chosen_and_flagged(joined):
 def test_files_and_record(joined):
     runs, out = joined
     names = {path.name for path in out.iterdir()}
-    assert names == {"dsm.tif", "sigma.tif", "quality.tif", "source.tif", "seams.tif", "seams.png", "run.json"}
+    rasters = {"dsm.tif", "sigma.tif", "quality.tif", "source.tif", "seams.tif"}
+    styles = {name for raster in rasters - {"source.tif"} for name in style_files(raster)}
+    assert names == {*rasters, *styles, "seams.png", "run.json"}
     run = record(out)
     assert run["command"] == "zlocus mosaic"
     assert [each["path"] for each in run["inputs"]][:2] == [str(runs.folders[0] / n) for n in ("dsm.tif", "sigma.tif")]

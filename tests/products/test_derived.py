@@ -26,6 +26,7 @@ from zlocus.core.requests import DEFAULT_PRODUCTS, PRODUCTS, added_products, pro
 from zlocus.io.config import config_as_dict
 from zlocus.io.crs import local_frame
 from zlocus.io.rasters import write_cog
+from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.products.derived import FILES, link_all, remove_derived, write_derived
 
 GRID = GeoBox((60, 80), Affine(1.0, 0, 500000, 0, -1.0, 4000000), "EPSG:32632")
@@ -174,7 +175,9 @@ def test_the_command(surface, tmp_path_factory):
     before = (surface / "hillshade.tif").read_bytes()
     assert run(surface, "--config", config).exit_code == 0
     assert (surface / "hillshade.tif").read_bytes() != before
-    assert names_in(surface) == SURFACE | set(FILES.values()) | {"item.json"}
+    made = SURFACE | set(FILES.values())
+    styles = {name for product in made if product in OF_SURFACE for name in style_files(product)}
+    assert names_in(surface) == made | styles | {"item.json"}
     assert "no map made" in run(surface, "--products", "none").stdout
 
 

@@ -45,8 +45,10 @@ def compare(options: CompareOptions, console: Console) -> Answer:
             comparison_values,
             write_comparison,
         )
+        from zlocus.products.styles import write_other_styles
 
         comparison = compared_runs(options.first, options.second, options.geoid)
         page = write_comparison(options.out, comparison)
+        write_other_styles(options.out, COMPARISON_FILES)
     text = [*comparison_text(comparison), f"{page}: open it in a browser."]
     return Answer("\n".join(text), {"page": str(page), **comparison_values(comparison)}, is_asked_for=True)

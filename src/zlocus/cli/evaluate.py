@@ -124,8 +124,9 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     check_for_points([*options.given(), *["--vegetated"] * (options.vegetated is not None)], str(options.references[0]))
     from zlocus.evaluation.comparison import Comparison
     from zlocus.evaluation.evaluate import evaluate as compare
-    from zlocus.evaluation.files import write_evaluation
+    from zlocus.evaluation.files import ERROR_MAP, write_evaluation
     from zlocus.evaluation.table import evaluation_table, main_figures_line
+    from zlocus.products.styles import write_other_styles
 
     comparison = Comparison(options.references[0], **arguments)
     with console.progress.stage("Comparing"):
@@ -136,6 +137,7 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     if options.out is None:
         return Answer(text, values, is_asked_for=True)
     write_evaluation(options.out, evaluation)
+    write_other_styles(options.out, [ERROR_MAP])
     _tell_in_metadata(options.out, options.dsm)
     files = [str(options.out / name) for name in EVALUATION_FILES]
     return Answer(f"{text}\n{options.out}: {', '.join(EVALUATION_FILES)} written.", {**values, "files": files}, True)
@@ -145,10 +147,11 @@ def _at_points(options: EvaluateOptions, arguments: dict[str, Any], console: Con
     """Compare a surface with points."""
     point_options = options.point_options(options.vegetated)
     from zlocus.evaluation.comparison import Comparison
-    from zlocus.evaluation.files import write_point_evaluation
+    from zlocus.evaluation.files import ERROR_MAP, write_point_evaluation
     from zlocus.evaluation.point_evaluation import evaluate_at_points
     from zlocus.evaluation.point_table import point_table
     from zlocus.evaluation.table import main_figures_line
+    from zlocus.io.styles.file_names import remove_styles
 
     comparison = Comparison(options.references[0], **arguments)
     with console.progress.stage("Comparing"):
@@ -157,6 +160,7 @@ def _at_points(options: EvaluateOptions, arguments: dict[str, Any], console: Con
     if options.out is None:
         return Answer(text, values, is_asked_for=True)
     names = write_point_evaluation(options.out, found)
+    remove_styles(options.out, [ERROR_MAP])
     _tell_in_metadata(options.out, options.dsm)
     files = [str(options.out / name) for name in names]
     return Answer(f"{text}\n{options.out}: {', '.join(names)} written.", {**values, "files": files}, True)

@@ -42,6 +42,7 @@ def products(options: ProductsOptions, console: Console) -> Answer:
     from zlocus.products.derived import FILES, link_all, write_derived
     from zlocus.products.metadata import METADATA
     from zlocus.products.report.file_names import REPORT
+    from zlocus.products.styles import write_styles
 
     existing_file(options.out / "dsm.tif", "surface")
     if options.config is None:
@@ -50,6 +51,7 @@ def products(options: ProductsOptions, console: Console) -> Answer:
         product_options = config_of(options.config, options.settings).products
     progress = console.progress
     write_derived(options.out, chosen, product_options, progress)
+    write_styles(options.out, product_options, [FILES[name] for name in chosen])
     link_all(options.out, progress)
     update_finished(options.out, (*(FILES[name] for name in chosen), ITEM, METADATA))
     made = [FILES[name] for name in chosen]

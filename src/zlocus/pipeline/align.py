@@ -34,6 +34,7 @@ from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.recorded_run import config_of
 from zlocus.products.derived import FILES, link_all, write_derived
 from zlocus.products.moved_surface import FLAGS, HEIGHTS, Move, write_moved
+from zlocus.products.styles import write_styles
 
 # Fewer passes of a satellite say little about the error that all points of a pass share.
 MIN_PASSES, MAX_LISTED_PASSES = 8, 100
@@ -195,7 +196,9 @@ def _notes(request: AlignRequest, sample: FitSample, fit: SurfaceFit) -> tuple[s
 def _derived(request: AlignRequest, progress: Progress) -> list[str]:
     """Make the maps that the surface has anew of the moved one, and return their names."""
     names = [name for name, file in FILES.items() if (request.surface / file).is_file()]
-    write_derived(request.out, names, _product_options(request.surface / RECORD), progress)
+    options = _product_options(request.surface / RECORD)
+    write_derived(request.out, names, options, progress)
+    write_styles(request.out, options)
     return [FILES[name] for name in names]
 
 

@@ -159,7 +159,7 @@ def plan_tasks(
     with stopwatch.stage("open"), progress.stage("Opening images"):
         run = open_run(request, config, progress)
     if run.finished is not None:
-        missing = missing_products(request, run.finished, progress)
+        missing = missing_products(request, config.products, run.finished, progress)
         if not missing.matched:
             return finished_tasks(request.out) or FinishedTasks(request.out, 0)
         request = whole_again(request, run.finished, missing, progress)

@@ -47,6 +47,7 @@ from zlocus.matching.quality import Quality
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.surface_workers import blocks_of
 from zlocus.products.change_tables import write_change_picture, write_volumes
+from zlocus.products.styles import write_other_styles
 
 COMMAND = "zlocus change"
 RECORD, DIFFERENCE, SIGMAS, SIGNIFICANCE, CLASSES, TABLE, LAYER, PICTURE = CHANGE_FILES
@@ -137,6 +138,7 @@ def run_change(request: ChangeRequest, progress: Progress) -> CommandOutcome:
                 volumes = _volumes(request, pair, noise, features, progress)
             names = _names(features)
             write_volumes(request.out / TABLE, request.out / LAYER, features, names, volumes, pair.placed[0].grid_crs)
+        write_other_styles(request.out, (DIFFERENCE, SIGMAS, SIGNIFICANCE, CLASSES))
         write_change_picture(request.out / PICTURE, request.out / DIFFERENCE, request.out / CLASSES, features, noise)
         inputs = inputs_record(
             [path for surface in surfaces for path in surface.files]

@@ -143,7 +143,7 @@ def _run_stages(request: DsmRequest, config: RunConfig, progress: Progress, tile
     if run.checkpoint.is_of_this_run and has_plan(request.out):
         progress.note(TAKES_PLAN_OVER.format(out=request.out))
     if run.finished is not None:
-        missing = missing_products(request, run.finished, progress)
+        missing = missing_products(request, config.products, run.finished, progress)
         if not missing.matched:
             return _already_finished(request, config, run, missing, progress)
         request = whole_again(request, run.finished, missing, progress)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from zlocus.core.errors import OutputError
-from zlocus.core.options import RunConfig
+from zlocus.core.options import ProductOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import FINISHED, OTHER_FOLDER, CloudRequest, DsmRequest, SetupRequest, held_files
 from zlocus.io.run_record import read_record
@@ -19,6 +19,7 @@ from zlocus.pipeline.setup import OpenedInputs, orient_views, set_up_run
 from zlocus.products.derived import FILES, link_all, write_derived
 from zlocus.products.metadata import METADATA
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
+from zlocus.products.styles import missing_styles, write_styles
 from zlocus.products.tie_layers import write_ties
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
 
@@ -34,7 +35,8 @@ class Missing:
     """Products of a finished run that are missing.
 
     matched : names of the files that only matching makes; of_ties : of those that the tie points make; maps : of maps,
-    as --products has them; report : whether that is missing; item : whether the item or the metadata are.
+    as --products has them; report : whether that is missing; item : whether the item or the metadata are; styles :
+    names of the style files of products that are there.
     """
 
     matched: tuple[str, ...]
@@ -42,12 +44,13 @@ class Missing:
     maps: tuple[str, ...]
     report: bool
     item: bool
+    styles: tuple[str, ...] = ()
 
     @property
     def files(self) -> tuple[str, ...]:
         """Names of the missing files that can be made without matching."""
         ends = (REPORT,) * self.report + (ITEM,) * self.item
-        return (*self.of_ties, *(FILES[name] for name in self.maps), *ends)
+        return (*self.of_ties, *(FILES[name] for name in self.maps), *ends, *self.styles)
 
 
 def finished_run(request: DsmRequest | CloudRequest, checkpoint: TileCheckpoint) -> Finished | None:
@@ -83,8 +86,8 @@ def finished_run(request: DsmRequest | CloudRequest, checkpoint: TileCheckpoint)
     return finished
 
 
-def missing_products(request: DsmRequest, finished: Finished, progress: Progress) -> Missing:
-    """Find the products that are missing from a finished run, or requested now in addition.
+def missing_products(request: DsmRequest, options: ProductOptions, finished: Finished, progress: Progress) -> Missing:
+    """Find the products that are missing from a finished run, or requested now in addition. options : of the run.
 
     Raises
     ------
@@ -100,6 +103,7 @@ def missing_products(request: DsmRequest, finished: Finished, progress: Progress
         maps=tuple(name for name in FILES if name in request.products and not (out / FILES[name]).is_file()),
         report=REPORT in gone,
         item=bool({ITEM, METADATA} & gone),
+        styles=missing_styles(out, options),
     )
 
 
@@ -175,6 +179,7 @@ def make_missing(
             _make_of_ties(request, config, opened_inputs, missing.of_ties, progress)
         if missing.maps:
             write_derived(out, missing.maps, config.products, progress)
+        write_styles(out, config.products)
         if missing.report:
             from zlocus.pipeline.report_inputs import try_report
 

@@ -41,7 +41,7 @@ from zlocus.pipeline.output_folder import made_folder, remove_earlier_products
 from zlocus.pipeline.surface_workers import blocks_of, results_of, slots_for
 from zlocus.products.blending import RunRelations, SeamKind
 from zlocus.products.mosaic_picture import PICTURE, write_picture
-from zlocus.products.mosaic_rasters import SOURCE, MosaicJob, MosaicRasters, OffsetJob, reaching
+from zlocus.products.mosaic_rasters import RASTERS, SOURCE, MosaicJob, MosaicRasters, OffsetJob, reaching
 from zlocus.products.run_offsets import (
     BLOCK_CELLS,
     PairOffset,
@@ -53,6 +53,7 @@ from zlocus.products.run_offsets import (
     pair_offset,
     run_offsets,
 )
+from zlocus.products.styles import write_other_styles
 
 COMMAND = "zlocus mosaic"
 DEFAULT_FEATHER_CELLS, MIN_FEATHER_CELLS, MAX_FEATHER_CELLS = 32, 2, 256
@@ -125,6 +126,7 @@ def run_mosaic(request: MosaicRequest, progress: Progress) -> CommandOutcome:
             job = _job(placement, pairs, feather_cells, progress)
             names, counts, n_of_run = _write(request, placement, job, usage, progress)
         write_picture(request.out, [str(surface.path) for surface in surfaces])
+        write_other_styles(request.out, RASTERS)
         with stopwatch.stage("checksums"), progress.stage("Checksums of the inputs"):
             more = [path for path in (request.like, request.geoid) if path is not None and path.is_file()]
             inputs = inputs_record([path for surface in surfaces for path in surface.files] + more)

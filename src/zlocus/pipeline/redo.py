@@ -50,6 +50,7 @@ from zlocus.pipeline.setup import orient_views, set_up_run
 from zlocus.pipeline.tile_run import TileProduct, TileRun, name_of, tile_job, workers_for
 from zlocus.products.derived import FILES, link_all, write_derived
 from zlocus.products.report.file_names import RECORD, REPORT
+from zlocus.products.styles import write_styles
 from zlocus.products.surface_statistics import surface_statistics
 from zlocus.products.tie_observations import read_observations
 
@@ -200,6 +201,7 @@ def _finished(
     with stopwatch.stage("products"):
         names = [name for name, file in FILES.items() if (old / file).is_file()]
         write_derived(new, names, part.config.products, progress)
+        write_styles(new, part.config.products, [*RASTERS, *(FILES[name] for name in names)])
         statistics = surface_statistics(new)
     entry = _entry(part, changed_cells, setup_digest, stopwatch)
     run = part.run | {

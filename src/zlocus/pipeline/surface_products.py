@@ -40,6 +40,8 @@ from zlocus.products.metadata import write_metadata
 from zlocus.products.ortho_colours import colour_records
 from zlocus.products.rasters import SurfaceRasters
 from zlocus.products.report.file_names import CURVES, RECORD
+from zlocus.products.stac_item import STYLES
+from zlocus.products.styles import write_styles
 from zlocus.products.surface_statistics import surface_statistics
 from zlocus.products.tie_layers import write_ranking, write_ties
 from zlocus.products.tie_observations import write_observations
@@ -47,6 +49,7 @@ from zlocus.products.tie_observations import write_observations
 # A surface with heights for a smaller share of the cells seen by two images is no success.
 SUFFICIENT_COVERAGE = 0.5
 RASTERS = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif")
+STYLE_NAMES = tuple(style.name for style in STYLES)
 
 
 def has_colours(request: DsmRequest, setup: RunSetup) -> bool:
@@ -118,6 +121,7 @@ def write_maps(
             write_derived(request.out, request.products, config.products, progress)
         except ZlocusError as error:
             failed = error
+        write_styles(request.out, config.products)
     write_record(request.out / "run.json", record)
     if request.report:
         from zlocus.pipeline.report_inputs import try_report
@@ -191,7 +195,7 @@ def written_record(out: Path) -> dict[str, Any]:
     rows, cols = record["grid"]["shape"]
     return {
         "run_record": str(out / RECORD),
-        "files": [str(out / name) for name in (*CHECKED, FINISHED) if (out / name).is_file()],
+        "files": [str(out / name) for name in (*CHECKED, FINISHED, *STYLE_NAMES) if (out / name).is_file()],
         "grid": {
             "crs": record["grid"]["crs"], "shape": [rows, cols],
             "bounds": [xmin, round(ymax + rows * e, 6), round(xmin + cols * a, 6), ymax],

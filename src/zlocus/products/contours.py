@@ -55,7 +55,7 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
     from shapely import linestrings
 
     with BandReader(raster) as reader:
-        interval = options.contour_interval_m or nice_interval(reader.statistic("STDDEV") or 0.0)
+        interval = contour_interval_m(reader, options)
         _check_number(reader, interval, raster)
         transform, crs = reader.geobox.transform, reader.crs or local_frame()
 
@@ -66,6 +66,11 @@ def write_contours(raster: Path, path: Path, options: ProductOptions, strip_rows
                 yield geometries, {"elevation_m": _rounded(np.array(levels, np.float64) * interval)}
 
         write_features(path, "contours", "LineString", batches(), crs)
+
+
+def contour_interval_m(reader: BandReader, options: ProductOptions) -> float:
+    """Difference in height between two contours of a raster, m: as the options say, else a round one."""
+    return options.contour_interval_m or nice_interval(reader.statistic("STDDEV") or 0.0)
 
 
 def nice_interval(deviation_m: float) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 from zlocus.core.errors import ConfigError, OutputError, ZlocusError
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import Progress
+from zlocus.io.styles.file_names import OF_SURFACE, remove_styles
 from zlocus.products.contours import write_contours
 from zlocus.products.dtm import write_dtm
 from zlocus.products.hillshade import write_hillshade
@@ -93,6 +94,7 @@ def remove_derived(folder: Path) -> None:
                 f"{folder / name} is of an earlier run and cannot be removed: {error.strerror}. Remove it, or choose "
                 "another folder with -o."
             ) from error
+    remove_styles(folder, OF_SURFACE)
 
 
 def _hillshade(folder: Path, path: Path, options: ProductOptions) -> None:

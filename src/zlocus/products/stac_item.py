@@ -15,6 +15,7 @@ from zlocus.io.atomic_write import write_atomically
 from zlocus.io.crs import crs_label
 from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
+from zlocus.io.styles.file_names import OF_SURFACE, QML, REASONS, SLD, TABLE, WITH_TABLE, style_files
 from zlocus.matching.quality import MEANINGS, Quality
 from zlocus.products.item_times import item_times, rfc3339
 from zlocus.products.rasters import WATER_MEANINGS, WaterKind
@@ -31,7 +32,8 @@ EXTENSIONS = {
 }  # fmt: skip
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 GEOPACKAGE, LAZ, JSON = "application/geopackage+sqlite3", "application/vnd.laszip", "application/json"
-HTML, GEOJSON, COPC = "text/html", "application/geo+json", "application/vnd.laszip+copc"
+HTML, GEOJSON, XML, COPC = "text/html", "application/geo+json", "application/xml", "application/vnd.laszip+copc"
+STYLE_MEDIA = {QML: "application/x-qgis-layer-settings", SLD: "application/vnd.ogc.sld+xml"}
 # Files whose points have the heights of dsm.tif, and its CRS with its vertical datum.
 WITH_HEIGHTS = (GEOPACKAGE, LAZ, COPC)
 STATISTICS = {"MINIMUM": "minimum", "MAXIMUM": "maximum", "MEAN": "mean", "STDDEV": "stddev",
@@ -67,8 +69,18 @@ PRODUCTS = (
     Product("footprints.geojson", "Footprints and overlaps of the images", GEOJSON, ("metadata",)),
     Product("curves.json", "Match curves of some cells", JSON, ("metadata",)),
     Product("events.jsonl", "Events of the run with their times", "application/x-ndjson", ("metadata",)),
-    Product("metadata.xml", "Lineage and quality by ISO 19115 and ISO 19157", "application/xml", ("metadata",)),
+    Product("metadata.xml", "Lineage and quality by ISO 19115 and ISO 19157", XML, ("metadata",)),
     Product("run.json", "Request, options, versions, inputs and times of the run", JSON, ("metadata",)),
+)
+# How programs draw the products, and what their values mean.
+STYLES = (
+    *(
+        Product(name, f"Style of {product}", STYLE_MEDIA[Path(name).suffix], ("style",))
+        for product in OF_SURFACE
+        for name in style_files(product)[:2]
+    ),
+    Product(f"{WITH_TABLE}{TABLE}", f"Names and counts of the values of {WITH_TABLE}", XML, ("metadata",)),
+    Product(REASONS, f"Reasons in {WITH_TABLE}, in groups", XML, ("metadata",)),
 )
 
 
@@ -93,7 +105,7 @@ def write_item(folder: Path) -> bool:
     footprint, times = footprint_of(folder / "dsm.tif"), item_times(folder)
     assets = {
         product.name.replace(".", "-"): asset_of(folder, product, crs)
-        for product in PRODUCTS
+        for product in (*PRODUCTS, *STYLES)
         if (folder / product.name).is_file()
     }
     properties = {

@@ -45,3 +45,7 @@ class ProductOptions(Checked):
         0.5, "Terrain: a cell is ground where its height is this close to the provisional terrain.",
         low=0.0, high=100.0, unit="m",
     )  # fmt: skip
+    styles: bool = option(
+        True, "Styles: for QGIS (.qml) and for map servers (.sld) beside each product, and an attribute table of "
+        "quality.tif.",
+    )  # fmt: skip

@@ -1,0 +1,89 @@
+"""How a layer is drawn, in terms that the style files of several programs can say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+# Red, green and blue, 0 to 255.
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class ValueColour:
+    """A value of a raster, or a stop between which colours are interpolated, its colour and what it means."""
+
+    value: float
+    colour: Colour
+    label: str
+
+
+@dataclass(frozen=True)
+class RampStyle:
+    """A quantity: colours are interpolated between stops, from the lowest on, and stay the same beyond them.
+
+    is_multiplied : the colours darken what lies below the layer, such as a hillshade.
+    """
+
+    stops: tuple[ValueColour, ...]
+    is_multiplied: bool = False
+
+
+@dataclass(frozen=True)
+class ClassStyle:
+    """Values that stand for classes; all others are transparent."""
+
+    classes: tuple[ValueColour, ...]
+
+
+@dataclass(frozen=True)
+class StretchStyle:
+    """An image: one grey band, or red, green and blue. ranges : values of each band that are black and full; has_mask :
+    whether a mask says where it has values."""
+
+    ranges: tuple[tuple[float, float], ...]
+    has_mask: bool = False
+
+
+RasterStyle = RampStyle | ClassStyle | StretchStyle
+
+
+@dataclass(frozen=True)
+class StyleRule:
+    """How some features of a layer are drawn.
+
+    size_mm : width of a line, or diameter of a point. ranges : the features have an attribute from the first number of
+    one of these on, below its second; every : or, where it is given, one that is a multiple of it, and `ranges` says
+    the same for programs that do not compute, empty where it cannot. A rule with neither is for all other features.
+    is_labelled : whether the attribute is written beside.
+    """
+
+    label: str
+    colour: Colour
+    size_mm: float
+    ranges: tuple[tuple[float, float], ...] = ()
+    every: float | None = None
+    is_labelled: bool = False
+
+
+@dataclass(frozen=True)
+class FeatureStyle:
+    """Lines or points, drawn by rules on one attribute. decimals : of labels."""
+
+    attribute: str
+    is_line: bool
+    rules: tuple[StyleRule, ...]
+    decimals: int = 0
+
+
+LayerStyle = RasterStyle | FeatureStyle
+
+
+def hexadecimal(colour: Colour) -> str:
+    """A colour as #rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def number(value: float) -> str:
+    """A number as style files write it: without an exponent, and as short as it can be."""
+    return str(int(value)) if math.isfinite(value) and value == int(value) else f"{value:.10f}".rstrip("0")

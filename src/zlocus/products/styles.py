@@ -1,0 +1,354 @@
+"""Styles beside the products of a result: how QGIS and map servers draw them, and what their values mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import MaskFlags
+
+from zlocus.core.options import ProductOptions
+from zlocus.evaluation.volumes import ChangeClass
+from zlocus.io.atomic_write import write_atomically
+from zlocus.io.open_raster import open_raster
+from zlocus.io.row_strips import BandReader, strips_of
+from zlocus.io.styles.attribute_table import TableRow, attribute_table
+from zlocus.io.styles.class_raster import class_raster
+from zlocus.io.styles.file_names import OF_SURFACE, WITH_TABLE, remove_styles, style_files
+from zlocus.io.styles.layer_style import (
+    ClassStyle,
+    Colour,
+    FeatureStyle,
+    LayerStyle,
+    RampStyle,
+    StretchStyle,
+    StyleRule,
+    ValueColour,
+    number,
+)
+from zlocus.io.styles.qml import qml_of
+from zlocus.io.styles.sld import sld_of
+from zlocus.matching.quality import flags_of, is_empty
+from zlocus.products.blending import SeamKind
+from zlocus.products.contours import contour_interval_m
+from zlocus.products.rasters import WaterKind
+from zlocus.products.report.maps import (
+    CONTOUR_COLOUR,
+    FLAG_GROUPS,
+    INDEX_EVERY,
+    NO_FLAG,
+    SPAN_PERCENT,
+    STRETCH_PERCENT,
+    groups_of,
+    ramp,
+)
+from zlocus.products.shade_kernel import BRIGHTEST, DARKEST
+
+# Cells along the longer side from which the range of values is taken.
+SAMPLE_CELLS = 512
+N_STOPS = 9
+# Grey values by which a hillshade is brightened.
+SHADE_GREY = 40.0
+# Colours of heights, which a hillshade below darkens: pale, from green lowlands to white tops.
+HEIGHT_COLOURS: tuple[Colour, ...] = (
+    (154, 200, 160), (191, 219, 165), (232, 232, 176), (240, 214, 150), (226, 183, 124), (203, 156, 117),
+    (206, 181, 160), (228, 220, 213), (255, 255, 255),
+)  # fmt: skip
+# Too low, right, too high: as in the report.
+TOO_LOW, RIGHT, TOO_HIGH = (0, 0, 225), (225, 225, 225), (225, 0, 0)
+# Differences have full colours from this percentile of their size on, significances from so many sigmas on.
+SATURATED_PERCENT, SATURATED_SIGMAS = 95.0, 5.0
+# More images than this have no class each.
+MAX_COUNTS = 32
+MAX_INDEX_CONTOURS = 200
+# Values of a smaller range are drawn as if it were 1.
+MIN_SPAN = 1e-3
+CONTOUR_MM, INDEX_CONTOUR_MM, POINT_MM = 0.15, 0.35, 1.6
+# Okabe and Ito.
+BLUE, SKY_BLUE, ORANGE, VERMILION = (0, 114, 178), (86, 180, 233), (230, 159, 0), (213, 94, 0)
+NAMES_OF_CHANGE = {
+    ChangeClass.UNCHANGED: ("no significant change", (225, 225, 225)), ChangeClass.RAISED: ("raised", (178, 24, 43)),
+    ChangeClass.LOWERED: ("lowered", (33, 102, 172)),
+}  # fmt: skip
+NAMES_OF_SEAMS = {
+    SeamKind.ONE: ("one run has a height", (225, 225, 225)),
+    SeamKind.BLENDED: ("runs agree, and are averaged", SKY_BLUE),
+    SeamKind.CHOSEN: ("runs contradict each other, and one is chosen", (200, 30, 0)),
+}  # fmt: skip
+NAMES_OF_WATER = {
+    WaterKind.LEVELLED: ("levelled inside a polygon", (10, 30, 130)),
+    WaterKind.POSSIBLE_LEVELLED: ("possible water, levelled", BLUE),
+    WaterKind.POSSIBLE: ("possible water, or a polygon without a level; heights are matched", SKY_BLUE),
+}  # fmt: skip
+RESIDUALS_PX = ((0.5, BLUE), (1.0, SKY_BLUE), (2.0, ORANGE), (math.inf, VERMILION))
+GOOD_IMAGES = ((0, VERMILION), (1, ORANGE), (2, SKY_BLUE), (3, BLUE))
+
+
+def write_styles(folder: Path, options: ProductOptions, renewed: Collection[str] = ()) -> None:
+    """Write the style files of the products of a surface that have none, where the options ask for styles.
+
+    A style is that of its product: it is made with it, and what users change in it stays until the product is made
+    again. renewed : products that were made again, whose earlier styles are replaced, or removed.
+
+    Raises
+    ------
+    InputError
+        A product is damaged.
+    OutputError
+        A file cannot be written.
+    """
+    remove_styles(folder, renewed)
+    if not options.styles:
+        return
+    for product in styled_products(folder):
+        if any(not (folder / name).exists() for name in style_files(product)):
+            _write_style(folder / product, _MAKERS[product], options)
+
+
+def missing_styles(folder: Path, options: ProductOptions) -> tuple[str, ...]:
+    """Names of the style files that the products in a folder lack."""
+    wanted = styled_products(folder) if options.styles else ()
+    return tuple(name for product in wanted for name in style_files(product) if not (folder / name).exists())
+
+
+def styled_products(folder: Path) -> tuple[str, ...]:
+    """Names of the products of a surface in a folder that can have a style."""
+    return tuple(name for name in OF_SURFACE if (folder / name).is_file())
+
+
+def write_other_styles(folder: Path, products: Collection[str]) -> None:
+    """Write the style files of products of other commands, in place of earlier ones; of those that are not there, the
+    earlier ones are removed.
+
+    Raises
+    ------
+    InputError, OutputError
+        See `write_styles`.
+    """
+    for product in [name for name in products if name in _MAKERS]:
+        remove_styles(folder, [product])
+        if (folder / product).is_file():
+            _write_style(folder / product, _MAKERS[product], ProductOptions())
+
+
+Maker = Callable[[Path, ProductOptions], LayerStyle]
+
+
+def _write_style(path: Path, make: Maker, options: ProductOptions) -> None:
+    """Write the files of a product that are missing."""
+    style = make(path, options)
+    texts = [qml_of(style), sld_of(style, path.stem)]
+    if path.name == WITH_TABLE:
+        texts += [flags_table(path), reasons_raster(path)]
+    for name, text in zip(style_files(path.name), texts, strict=True):
+        if not (path.parent / name).exists():
+            write_atomically(path.parent / name, partial(Path.write_text, data=text, encoding="utf-8"))
+
+
+def _heights(path: Path, options: ProductOptions) -> RampStyle:
+    low, high = _percentiles(_sample(path), SPAN_PERCENT)
+    step = 10.0 ** (math.floor(math.log10(high - low)) - 1)
+    return _even_ramp(
+        math.floor(low / step) * step, math.ceil(high / step) * step, HEIGHT_COLOURS, "m", is_multiplied=True
+    )
+
+
+def _sigmas(path: Path, options: ProductOptions) -> RampStyle:
+    high = _round_up(_percentiles(_sample(path), SPAN_PERCENT)[1])
+    # Squares give the many small values different colours, as in the report.
+    values = high * np.linspace(0.0, 1.0, N_STOPS) ** 2
+    return _ramp(values, _table(cv2.COLORMAP_CIVIDIS, N_STOPS), _decimals(high) + 1, "m")
+
+
+def _differences(path: Path, options: ProductOptions) -> RampStyle:
+    high = _round_up(_percentiles(np.abs(_sample(path)), (0.0, SATURATED_PERCENT))[1])
+    return _even_ramp(-high, high, (TOO_LOW, RIGHT, TOO_HIGH), "m")
+
+
+def _significances(path: Path, options: ProductOptions) -> RampStyle:
+    return _even_ramp(-SATURATED_SIGMAS, SATURATED_SIGMAS, (TOO_LOW, RIGHT, TOO_HIGH), "sigma")
+
+
+def _hillshade(path: Path, options: ProductOptions) -> StretchStyle:
+    # Grey in place of black, so that colours above it can be seen.
+    return StretchStyle(((DARKEST - SHADE_GREY, BRIGHTEST - SHADE_GREY),))
+
+
+def _ortho(path: Path, options: ProductOptions) -> StretchStyle:
+    with open_raster(path, "raster") as file:
+        bands = range(1, 4) if file.count >= 3 else range(1, 2)
+        has_mask = MaskFlags.per_dataset in file.mask_flag_enums[0]
+    return StretchStyle(tuple(_percentiles(_sample(path, band), STRETCH_PERCENT) for band in bands), has_mask)
+
+
+def _counts(path: Path, options: ProductOptions) -> ClassStyle | RampStyle:
+    with BandReader(path) as reader:
+        low, high = int(reader.statistic("MINIMUM") or 1), int(reader.statistic("MAXIMUM") or 1)
+    if high - low >= MAX_COUNTS:
+        return _ramp(np.linspace(low, high, N_STOPS), _table(cv2.COLORMAP_VIRIDIS, N_STOPS), 0, "images")
+    # The colours of the report, in which 1 is the darkest.
+    colours = _table(cv2.COLORMAP_VIRIDIS, high)
+    counts = range(low, high + 1)
+    return ClassStyle(tuple(ValueColour(k, colours[k - 1], f"{k} image{'s' * (k > 1)}") for k in counts))
+
+
+def _flags(path: Path, options: ProductOptions) -> ClassStyle:
+    return ClassStyle(tuple(_colour_of_flags(code) for code in _in_groups(_codes(path))))
+
+
+def flags_table(path: Path) -> str:
+    """The attribute table of quality.tif: a row for each value with its flags by name, its number of cells, the group
+    in which the report counts it, and whether such cells have a height."""
+    counts = _codes(path)
+    rows = []
+    for code in _in_groups(counts):
+        has_height = int(not is_empty(np.array([code], np.uint16))[0])
+        rows.append(TableRow(_colour_of_flags(code), int(counts[code]), (has_height, _group_of_flags(code)[0])))
+    return attribute_table(rows, ("HasHeight", "Group"))
+
+
+def reasons_raster(path: Path) -> str:
+    """The raster of the groups in which the report counts the cells of quality.tif."""
+    names = [*((name, colour) for name, _, colour in FLAG_GROUPS), NO_FLAG]
+    groups = groups_of(np.arange(1 << 16))
+    # Between two values GDAL interpolates.
+    codes = {0, int(groups.size - 1), *np.flatnonzero(_codes(path)).tolist()}
+    classes = [ValueColour(k, colour, name) for k, (name, colour) in enumerate(names)]
+    return class_raster(path, classes, {code: int(groups[code]) for code in codes})
+
+
+def _codes(path: Path) -> NDArray[np.int64]:
+    """Number of cells (65536,) with each value of quality.tif."""
+    counts = np.zeros(1 << 16, np.int64)
+    with BandReader(path) as reader:
+        for strip in strips_of(reader.geobox.shape[0]):
+            counts += np.bincount(reader.read(strip).ravel(), minlength=len(counts))
+    return counts
+
+
+def _in_groups(counts: NDArray[np.int64]) -> list[int]:
+    """The values that occur, group after group as the report lists them, and in each the frequent ones first."""
+    codes = np.flatnonzero(counts)
+    order = np.lexsort((codes, -counts[codes], groups_of(codes)))
+    return [int(code) for code in codes[order]]
+
+
+def _group_of_flags(code: int) -> tuple[str, Colour]:
+    group = int(groups_of(np.array([code]))[0])
+    if group == len(FLAG_GROUPS):
+        return NO_FLAG
+    name, _, colour = FLAG_GROUPS[group]
+    return name, colour
+
+
+def _colour_of_flags(code: int) -> ValueColour:
+    names = ", ".join(str(flag.name) for flag in flags_of(code)) if code else NO_FLAG[0]
+    return ValueColour(code, _group_of_flags(code)[1], names)
+
+
+def _named(names: Mapping[Any, tuple[str, Colour]]) -> Maker:
+    """A style of classes with fixed names and colours. names : and colours, by the value of the class."""
+    classes = tuple(ValueColour(int(value), colour, label) for value, (label, colour) in names.items())
+    return lambda path, options: ClassStyle(classes)
+
+
+def _contours(path: Path, options: ProductOptions) -> FeatureStyle:
+    raster = path.parent / f"{options.contours_of}.tif"
+    with BandReader(raster if raster.is_file() else path.parent / "dsm.tif") as reader:
+        interval_m = contour_interval_m(reader, options)
+        low, mean, high = (reader.statistic(name) or 0.0 for name in ("MINIMUM", "MEAN", "MAXIMUM"))
+    index_m = INDEX_EVERY * interval_m
+    # Programs without expressions get a list of heights, around the mean where blunders make it long.
+    middle = round(mean / index_m)
+    first = max(math.ceil(low / index_m), middle - MAX_INDEX_CONTOURS // 2)
+    last = min(math.floor(high / index_m), middle + MAX_INDEX_CONTOURS // 2)
+    multiples = range(first, last + 1)
+    ranges = tuple((k * index_m - interval_m / 2, k * index_m + interval_m / 2) for k in multiples)
+    blue, green, red = CONTOUR_COLOUR
+    colour = (red, green, blue)
+    decimals = len(number(index_m).partition(".")[2])
+    index = StyleRule(f"every {number(index_m)} m", colour, INDEX_CONTOUR_MM, ranges, index_m, is_labelled=True)
+    return FeatureStyle(
+        "elevation_m", True, (index, StyleRule(f"every {number(interval_m)} m", colour, CONTOUR_MM)), decimals
+    )
+
+
+def _ties(path: Path, options: ProductOptions) -> FeatureStyle:
+    rules, low = [], -math.inf
+    for high, colour in RESIDUALS_PX:
+        label = f"residual below {high:g} px" if high < math.inf else f"residual of {low:g} px or more"
+        rules.append(StyleRule(label, colour, POINT_MM, ((low, high),)))
+        low = high
+    return FeatureStyle("residual_px", False, tuple(rules))
+
+
+def _ranking(path: Path, options: ProductOptions) -> FeatureStyle:
+    rules = []
+    for n, colour in GOOD_IMAGES:
+        is_last = n == GOOD_IMAGES[-1][0]
+        label = f"{n}{' or more' * is_last} image{'s' * (n != 1)} that match well"
+        ends = (n - 0.5 if n else -math.inf, math.inf if is_last else n + 0.5)
+        rules.append(StyleRule(label, colour, POINT_MM, (ends,)))
+    return FeatureStyle("n_good", False, tuple(rules))
+
+
+def _sample(path: Path, band: int = 1) -> NDArray[np.float64]:
+    """Known values (n,) of cells spread evenly over a raster, or of its overview."""
+    with open_raster(path, "raster") as file:
+        scale = min(SAMPLE_CELLS / max(file.shape), 1.0)
+        shape = max(round(file.height * scale), 1), max(round(file.width * scale), 1)
+        values = file.read(band, out_shape=shape, masked=True)
+    known = np.asarray(values.compressed(), np.float64)
+    return known[np.isfinite(known)]
+
+
+def _percentiles(sample: NDArray[np.float64], percent: tuple[float, float]) -> tuple[float, float]:
+    """Two percentiles of values, the second one larger; 0 and 1 without any."""
+    low, high = (float(value) for value in np.percentile(sample, percent)) if sample.size else (0.0, 1.0)
+    return low, high if high > low + MIN_SPAN else low + 1.0
+
+
+def _round_up(value: float) -> float:
+    """The next number with two digits that is not smaller, at least a millimetre."""
+    step = 10.0 ** (math.floor(math.log10(max(value, 1e-3))) - 1)
+    return math.ceil(max(value, 1e-3) / step - 1e-9) * step
+
+
+def _decimals(span: float) -> int:
+    """Decimals of values that fill a span, of two digits or more."""
+    return max(0, 1 - math.floor(math.log10(span)))
+
+
+def _even_ramp(low: float, high: float, colours: Sequence[Colour], unit: str, is_multiplied: bool = False) -> RampStyle:
+    values = np.linspace(low, high, len(colours))
+    return _ramp(values, colours, _decimals(high - low), unit, is_multiplied)
+
+
+def _ramp(
+    values: NDArray[np.float64], colours: Sequence[Colour], decimals: int, unit: str, is_multiplied: bool = False
+) -> RampStyle:
+    stops = tuple(
+        ValueColour(round(float(value), 6), colour, f"{value:.{decimals}f} {unit}")
+        for value, colour in zip(values, colours, strict=True)
+    )
+    return RampStyle(stops, is_multiplied)
+
+
+def _table(table: int, n: int) -> list[Colour]:
+    """Colours of one of OpenCV's tables, from its start to its end."""
+    return [(int(red), int(green), int(blue)) for blue, green, red in ramp(table, n)]
+
+
+_MAKERS: dict[str, Maker] = {
+    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "quality.tif": _flags, "views.tif": _counts,
+    "ortho.tif": _ortho, "water.tif": _named(NAMES_OF_WATER), "hillshade.tif": _hillshade,
+    "contours.gpkg": _contours, "ties.gpkg": _ties, "ranking.gpkg": _ranking,
+    "error.tif": _differences, "difference.tif": _differences, "significance.tif": _significances,
+    "class.tif": _named(NAMES_OF_CHANGE), "seams.tif": _named(NAMES_OF_SEAMS),
+}  # fmt: skip
