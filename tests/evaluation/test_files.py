@@ -25,6 +25,7 @@ from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
 from zlocus.evaluation.histogram import histogram_figure
 from zlocus.evaluation.slopes import SLOPE_EDGES_DEG
+from zlocus.io.styles.file_names import style_files
 
 N = 120
 PAGE = ROOT / "docs" / "how-to" / "evaluate.md"
@@ -50,7 +51,7 @@ def test_the_folder_holds_figures_map_and_histogram(tmp_path, pair):
     out = tmp_path / "deep" / "out"
     result = run(*pair, "--margin", 0, "-o", out, "--json", "--threshold", 0.3, "--threshold", 1)
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in out.iterdir()) == sorted(files.NAMES)
+    assert sorted(path.name for path in out.iterdir()) == sorted([*files.NAMES, *style_files(files.ERROR_MAP)])
     printed, kept = json.loads(result.stdout), json.loads((out / "evaluation.json").read_text())
     of_all = ("command", "version", "exit_status", "out", "files")  # entries of every command
     assert kept == {"schema": 2} | {name: value for name, value in printed.items() if name not in of_all}
@@ -150,7 +151,8 @@ def test_a_failed_write_leaves_no_part(tmp_path, pair, monkeypatch):
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
     assert "histogram.png cannot be written: No space left on device" in result.stderr
     # The figures of the evaluation before are gone: they are not those of the new map.
-    assert sorted(path.name for path in out.iterdir()) == ["error.tif", "histogram.png"]
+    left = [*style_files(files.ERROR_MAP), "error.tif", "histogram.png"]
+    assert sorted(path.name for path in out.iterdir()) == sorted(left)
 
 
 def test_another_evaluation_is_replaced_only_on_request(tmp_path, pair):
