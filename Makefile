@@ -15,7 +15,7 @@ ROW ?= $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
 WORDS := $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
 endif
 
-.PHONY: demo docs test test-fast test-minimum audit lint bench peers acceptance acceptance-all measure measure-all figures stale \
+.PHONY: demo docs test test-fast test-minimum audit lint qgis-plugin test-qgis bench peers acceptance acceptance-all measure measure-all figures stale \
     numbers release-check clean
 .DEFAULT_GOAL := test
 
@@ -70,6 +70,15 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy || $(BIN)/mypy --num-workers 0
 	$(BIN)/lint-imports
+
+# The plugin of QGIS as an archive, for its `Install from ZIP`.
+qgis-plugin:
+	$(PYTHON) qgis/package.py build/zlocus_processing.zip
+
+# The plugin and the styles in QGIS without a window. ZLOCUS_QGIS_PICTURES names a folder for pictures to look at.
+test-qgis: $(STAMP)
+	command -v qgis_process > /dev/null || { echo "QGIS is missing: apt-get install --no-install-recommends qgis python3-qgis"; exit 1; }
+	$(BIN)/python -m pytest -n 0 qgis/tests
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only

@@ -1,0 +1,187 @@
+"""Run by QGIS's own Python: draws layers with their styles, loads results into a project, cancels a run.
+
+draw FOLDER OUT | load FOLDER | cancel OUT IMAGE... The last line that is printed is an object of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+
+from qgis.core import (
+    QgsApplication,
+    QgsLayerTreeModel,
+    QgsLegendRenderer,
+    QgsLegendSettings,
+    QgsMapRendererSequentialJob,
+    QgsMapSettings,
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingFeedback,
+    QgsProject,
+    QgsRasterLayer,
+    QgsVectorLayer,
+)
+from qgis.PyQt.QtCore import QSize, Qt
+from qgis.PyQt.QtGui import QColor, QImage, QPainter
+
+WIDTH, HEIGHT, DPI = 640, 640, 96
+LONG_S = 60.0
+
+
+def begin():
+    """QGIS with Processing and the plugin."""
+    QgsApplication.setPrefixPath("/usr", True)
+    application = QgsApplication([], False)
+    application.initQgis()
+    sys.path += [os.path.join(QgsApplication.pkgDataPath(), "python", "plugins"), os.environ["QGIS_PLUGINPATH"]]
+    from processing.core.Processing import Processing
+
+    Processing.initialize()
+    import zlocus_processing
+
+    plugin = zlocus_processing.classFactory(None)
+    plugin.initProcessing()
+    return application, plugin
+
+
+def layer_of(folder, name):
+    """A file as a layer, as if it was dropped into the window: with the style of its name."""
+    path = os.path.join(folder, name)
+    layer = QgsVectorLayer(path, name) if name.endswith(".gpkg") else QgsRasterLayer(path, name)
+    assert layer.isValid(), path
+    return layer
+
+
+def picture(layers, extent):
+    """A map of layers, the first one on top."""
+    settings = QgsMapSettings()
+    settings.setLayers(layers)
+    settings.setDestinationCrs(layers[0].crs())
+    settings.setExtent(extent)
+    settings.setOutputSize(QSize(WIDTH, HEIGHT))
+    settings.setOutputDpi(DPI)
+    settings.setBackgroundColor(QColor("white"))
+    job = QgsMapRendererSequentialJob(settings)
+    job.start()
+    job.waitForFinished()
+    return job.renderedImage()
+
+
+def legend(layer):
+    """The legend of a layer as a picture, and its texts."""
+    project = QgsProject()
+    project.addMapLayer(layer.clone())
+    model = QgsLayerTreeModel(project.layerTreeRoot())
+    renderer = QgsLegendRenderer(model, QgsLegendSettings())
+    size = renderer.minimumSize()
+    image = QImage(int(size.width() * 4) + 8, int(size.height() * 4) + 8, QImage.Format_RGB32)
+    image.fill(Qt.white)
+    image.setDotsPerMeterX(4000)
+    image.setDotsPerMeterY(4000)
+    painter = QPainter(image)
+    painter.scale(4.0, 4.0)
+    renderer.drawLegend(painter)
+    painter.end()
+    node = project.layerTreeRoot().findLayers()[0]
+    return image, [str(part.data(Qt.DisplayRole) or "") for part in model.layerLegendNodes(node)]
+
+
+def n_colours(image):
+    """Number of different colours of a picture, counted on every fourth pixel."""
+    return len({image.pixel(x, y) for x in range(0, image.width(), 4) for y in range(0, image.height(), 4)})
+
+
+def draw(folder, out):
+    """Draw all products with their styles; say how, and what their legends say."""
+    os.makedirs(out, exist_ok=True)
+    found = {}
+    names = sorted(name for name in os.listdir(folder) if name.endswith((".tif", ".gpkg", ".vrt")))
+    extent = layer_of(folder, next(name for name in names if name.endswith(".tif"))).extent()
+    for name in names:
+        layer = layer_of(folder, name)
+        stem = os.path.splitext(name)[0]
+        drawn = picture([layer], extent)
+        drawn.save(os.path.join(out, name + ".png"))
+        image, texts = legend(layer)
+        image.save(os.path.join(out, name + ".legend.png"))
+        entry = {"renderer": layer.renderer().type(), "colours": n_colours(drawn), "legend": texts}
+        style = os.path.join(folder, stem + ".qml")
+        if os.path.isfile(style):
+            entry["qml"] = layer.loadNamedStyle(style)
+            entry["reloaded"] = picture([layer], extent) == drawn
+        style = os.path.join(folder, stem + ".sld")
+        if os.path.isfile(style) and name.endswith(".gpkg"):
+            entry["sld"] = layer.loadSldStyle(style)
+            by_sld = picture([layer], extent)
+            by_sld.save(os.path.join(out, name + ".sld.png"))
+            entry["colours_by_sld"] = n_colours(by_sld)
+        found[name] = entry
+    if {"dsm.tif", "hillshade.tif"} <= set(names):
+        relief = [layer_of(folder, name) for name in ("contours.gpkg", "dsm.tif", "hillshade.tif") if name in names]
+        picture(relief, extent).save(os.path.join(out, "relief.png"))
+    return found
+
+
+def load(folder):
+    """Compute maps with the algorithm, and load all layers as the window of QGIS does."""
+    from processing.gui.Postprocessing import handleAlgorithmResults
+
+    context, feedback = QgsProcessingContext(), QgsProcessingFeedback()
+    project = QgsProject.instance()
+    context.setProject(project)
+    algorithm = QgsApplication.processingRegistry().algorithmById("zlocus:products").create()
+    _, is_done = algorithm.run({"FOLDER": folder, "MAPS": [0, 1, 2]}, context, feedback)
+    assert is_done, feedback.textLog()
+    assert handleAlgorithmResults(algorithm, context, feedback)
+    layers = project.layerTreeRoot().findLayers()
+    return {
+        "groups": [group.name() for group in project.layerTreeRoot().findGroups()],
+        "layers": [node.name() for node in layers],
+        "visible": [node.name() for node in layers if node.itemVisibilityChecked()],
+        "renderers": [node.layer().renderer().type() for node in layers],
+        "percent": feedback.progress(),
+    }
+
+
+class Cancelling(QgsProcessingFeedback):
+    """Cancels once a line begins in a given way."""
+
+    def __init__(self, beginning):
+        super().__init__()
+        self.beginning, self.lines, self.percents = beginning, [], []
+
+    def pushInfo(self, line):
+        self.lines.append(line)
+        if self.beginning and line.startswith(self.beginning):
+            self.cancel()
+
+
+def cancel(out, *images):
+    """Cancel a run, and run it to its end afterwards."""
+    algorithm = QgsApplication.processingRegistry().algorithmById("zlocus:dsm").create()
+    values = {"INPUT": list(images), "RESOLUTION": 0.5, "OUTPUT": out, "OPTIONS": "--set pyramid.tile=64"}
+    found = {}
+    for name, beginning in (("first", "Plan:"), ("second", "")):
+        feedback, context = Cancelling(beginning), QgsProcessingContext()
+        begun = time.monotonic()
+        try:
+            results, is_done = algorithm.run(values, context, feedback)
+            error = ""
+        except QgsProcessingException as raised:
+            results, is_done, error = {}, False, str(raised)
+        found[name] = {
+            "results": results, "done": is_done, "lines": feedback.lines, "error": error,
+            "seconds": time.monotonic() - begun, "files": sorted(os.listdir(out)) if os.path.isdir(out) else [],
+        }  # fmt: skip
+    return found
+
+
+if __name__ == "__main__":
+    application, plugin = begin()
+    answer = {"draw": draw, "load": load, "cancel": cancel}[sys.argv[1]](*sys.argv[2:])
+    print(json.dumps(answer), flush=True)
+    # QGIS's objects may outlive each other in a wrong order.
+    os._exit(0)
