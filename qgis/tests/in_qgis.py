@@ -82,7 +82,6 @@ def legend(layer):
     image.setDotsPerMeterX(4000)
     image.setDotsPerMeterY(4000)
     painter = QPainter(image)
-    painter.scale(4.0, 4.0)
     renderer.drawLegend(painter)
     painter.end()
     node = project.layerTreeRoot().findLayers()[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rasterio
 from rasterio.warp import transform_bounds
@@ -39,9 +38,8 @@ def test_the_same_values_find_the_surface_finished(qgis, images, surface):
 def middle(scene):
     """A box of 24 m in the middle of the scene: xmin, ymin, xmax, ymax in UTM."""
     with rasterio.open(scene / "truth_dsm.tif") as file:
-        x, y = (
-            np.add(*ends) / 2 for ends in ((file.bounds.left, file.bounds.right), (file.bounds.bottom, file.bounds.top))
-        )
+        west, south, east, north = file.bounds
+    x, y = (west + east) / 2, (south + north) / 2
     return [x - 12, y - 12, x + 12, y + 12]
 
 
