@@ -57,6 +57,12 @@ def test_values_have_colours_and_names(style):
     assert texts(root, f"{SLD}Name") == ["layer", "layer"]
 
 
+def test_classes_are_in_the_order_of_their_values():
+    """As MapServer needs them, which draws intervals."""
+    root = read(ClassStyle(tuple(ValueColour(value, RED, "") for value in (2050, 2, 16))))
+    assert [entry.get("quantity") for entry in root.iter(f"{SLD}ColorMapEntry")] == ["2", "16", "2050"]
+
+
 def test_a_layer_that_is_multiplied_says_so():
     style = RampStyle((ValueColour(0, RED, ""), ValueColour(1, RED, "")), is_multiplied=True)
     (option,) = read(style).iter(f"{SLD}VendorOption")
@@ -64,8 +70,9 @@ def test_a_layer_that_is_multiplied_says_so():
 
 
 def test_images_are_stretched():
-    (colours,) = read(StretchStyle(((1.0, 255.0),))).iter(f"{SLD}ColorMap")
-    assert [(entry.get("color"), entry.get("quantity")) for entry in colours] == [("#000000", "1"), ("#ffffff", "255")]
+    (colours,) = read(StretchStyle(((0.0, 510.0),))).iter(f"{SLD}ColorMap")
+    greys = [(entry.get("color"), entry.get("quantity")) for entry in colours]
+    assert (greys[0], greys[1], greys[-1]) == (("#000000", "0"), ("#050505", "10"), ("#ffffff", "510"))
     root = read(StretchStyle(((1.0, 2.0), (3.0, 4.0), (5.0, 6.0))))
     assert texts(root, f"{SLD}SourceChannelName") == ["1", "2", "3"]
     limits = [option.text for option in root.iter(f"{SLD}VendorOption") if option.get("name") != "algorithm"]

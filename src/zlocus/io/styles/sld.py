@@ -22,7 +22,8 @@ COLOUR_CHANNELS = ("RedChannel", "GreenChannel", "BlueChannel")
 # A pixel of SLD is 0.28 mm wide.
 PX_PER_MM = 1.0 / 0.28
 LABEL_PX, HALO_PX, REPEAT_PX = 10, 2, 300
-BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+WHITE = (255, 255, 255)
+N_GREYS = 52
 
 
 def sld_of(style: LayerStyle, name: str) -> str:
@@ -47,13 +48,19 @@ def _symbolizer(style: RampStyle | ClassStyle | StretchStyle) -> Element:
     if isinstance(style, StretchStyle) and len(style.ranges) > 1:
         return node("RasterSymbolizer", opacity, _channels(style))
     if isinstance(style, ClassStyle):
-        kind, entries = "values", style.classes
+        # MapServer takes each value as the lower end of an interval.
+        kind, entries = "values", tuple(sorted(style.classes, key=lambda colour: colour.value))
     elif isinstance(style, RampStyle):
         kind, entries = "ramp", style.stops
     else:
-        (low, high), kind = style.ranges[0], "ramp"
-        entries = (ValueColour(low, BLACK, ""), ValueColour(high, WHITE, ""))
+        kind, entries = "ramp", _greys(*style.ranges[0])
     return node("RasterSymbolizer", opacity, node("ColorMap", *map(_entry, entries), type=kind))
+
+
+def _greys(low: float, high: float) -> tuple[ValueColour, ...]:
+    """Stops from black to white, many, because MapServer draws steps and no ramp."""
+    shares = [k / (N_GREYS - 1) for k in range(N_GREYS)]
+    return tuple(ValueColour(round(low + share * (high - low), 6), (round(share * 255),) * 3, "") for share in shares)
 
 
 def _entry(colour: ValueColour) -> Element:
