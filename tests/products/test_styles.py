@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from xml.etree import ElementTree
 
@@ -18,6 +19,7 @@ from zlocus.io.styles.file_names import OF_SURFACE, REASONS, style_files
 from zlocus.matching.quality import Quality
 from zlocus.products.derived import write_derived
 from zlocus.products.report.maps import FLAG_GROUPS, NO_FLAG, groups_of
+from zlocus.products.stac_item import write_item
 from zlocus.products.styles import MAX_INDEX_CONTOURS, missing_styles, write_other_styles, write_styles
 
 GRID = GeoBox((60, 80), Affine(1.0, 0, 500000, 0, -1.0, 4000000), "EPSG:32632")
@@ -118,6 +120,16 @@ def test_every_fifth_contour_is_thick_and_has_a_label(surface):
     assert {102.25, 102.75, 104.75, 105.25} <= set(levels)
     # Of the heights up to that of the blunder those around the mean are listed.
     assert len(levels) <= 2 * (MAX_INDEX_CONTOURS + 1)
+
+
+def test_the_item_links_styles(surface):
+    write_styles(surface, ProductOptions())
+    write_item(surface)
+    assets = json.loads((surface / "item.json").read_text())["assets"]
+    roles = {asset["href"]: asset["roles"] for asset in assets.values()}
+    assert roles["./dsm.qml"] == roles["./quality.sld"] == ["style"]
+    assert roles["./quality.tif.aux.xml"] == roles[f"./{REASONS}"] == ["metadata"]
+    assert assets["dsm-qml"]["type"] == "application/x-qgis-layer-settings"
 
 
 def test_styles_can_be_left_out(surface):

@@ -17,9 +17,7 @@ from zlocus.core.options import ProductOptions
 from zlocus.evaluation.volumes import ChangeClass
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.open_raster import open_raster
-from zlocus.io.row_strips import BandReader, strips_of
-from zlocus.io.styles.attribute_table import TableRow, attribute_table
-from zlocus.io.styles.class_raster import class_raster
+from zlocus.io.row_strips import BandReader
 from zlocus.io.styles.file_names import OF_SURFACE, WITH_TABLE, remove_styles, style_files
 from zlocus.io.styles.layer_style import (
     ClassStyle,
@@ -34,18 +32,15 @@ from zlocus.io.styles.layer_style import (
 )
 from zlocus.io.styles.qml import qml_of
 from zlocus.io.styles.sld import sld_of
-from zlocus.matching.quality import flags_of, is_empty
 from zlocus.products.blending import SeamKind
 from zlocus.products.contours import contour_interval_m
+from zlocus.products.flag_styles import FlagValues
 from zlocus.products.rasters import WaterKind
 from zlocus.products.report.maps import (
     CONTOUR_COLOUR,
-    FLAG_GROUPS,
     INDEX_EVERY,
-    NO_FLAG,
     SPAN_PERCENT,
     STRETCH_PERCENT,
-    groups_of,
     ramp,
 )
 from zlocus.products.shade_kernel import BRIGHTEST, DARKEST
@@ -103,12 +98,12 @@ def write_styles(folder: Path, options: ProductOptions, renewed: Collection[str]
     OutputError
         A file cannot be written.
     """
-    remove_styles(folder, renewed)
+    remove_styles(folder, [name for name in renewed if name in OF_SURFACE])
     if not options.styles:
         return
     for product in styled_products(folder):
         if any(not (folder / name).exists() for name in style_files(product)):
-            _write_style(folder / product, _MAKERS[product], options)
+            _write_style(folder / product, options)
 
 
 def missing_styles(folder: Path, options: ProductOptions) -> tuple[str, ...]:
@@ -131,21 +126,21 @@ def write_other_styles(folder: Path, products: Collection[str]) -> None:
     InputError, OutputError
         See `write_styles`.
     """
-    for product in [name for name in products if name in _MAKERS]:
+    for product in [name for name in products if name in _MAKERS or name == WITH_TABLE]:
         remove_styles(folder, [product])
         if (folder / product).is_file():
-            _write_style(folder / product, _MAKERS[product], ProductOptions())
+            _write_style(folder / product, ProductOptions())
 
 
 Maker = Callable[[Path, ProductOptions], LayerStyle]
 
 
-def _write_style(path: Path, make: Maker, options: ProductOptions) -> None:
+def _write_style(path: Path, options: ProductOptions) -> None:
     """Write the files of a product that are missing."""
-    style = make(path, options)
-    texts = [qml_of(style), sld_of(style, path.stem)]
-    if path.name == WITH_TABLE:
-        texts += [flags_table(path), reasons_raster(path)]
+    flags = FlagValues.of(path) if path.name == WITH_TABLE else None
+    style = flags.style() if flags is not None else _MAKERS[path.name](path, options)
+    of_flags = () if flags is None else (flags.table(), flags.reasons())
+    texts = (qml_of(style), sld_of(style, path.stem), *of_flags)
     for name, text in zip(style_files(path.name), texts, strict=True):
         if not (path.parent / name).exists():
             write_atomically(path.parent / name, partial(Path.write_text, data=text, encoding="utf-8"))
@@ -196,60 +191,6 @@ def _counts(path: Path, options: ProductOptions) -> ClassStyle | RampStyle:
     colours = _table(cv2.COLORMAP_VIRIDIS, high)
     counts = range(low, high + 1)
     return ClassStyle(tuple(ValueColour(k, colours[k - 1], f"{k} image{'s' * (k > 1)}") for k in counts))
-
-
-def _flags(path: Path, options: ProductOptions) -> ClassStyle:
-    return ClassStyle(tuple(_colour_of_flags(code) for code in _in_groups(_codes(path))))
-
-
-def flags_table(path: Path) -> str:
-    """The attribute table of quality.tif: a row for each value with its flags by name, its number of cells, the group
-    in which the report counts it, and whether such cells have a height."""
-    counts = _codes(path)
-    rows = []
-    for code in _in_groups(counts):
-        has_height = int(not is_empty(np.array([code], np.uint16))[0])
-        rows.append(TableRow(_colour_of_flags(code), int(counts[code]), (has_height, _group_of_flags(code)[0])))
-    return attribute_table(rows, ("HasHeight", "Group"))
-
-
-def reasons_raster(path: Path) -> str:
-    """The raster of the groups in which the report counts the cells of quality.tif."""
-    names = [*((name, colour) for name, _, colour in FLAG_GROUPS), NO_FLAG]
-    groups = groups_of(np.arange(1 << 16))
-    # Between two values GDAL interpolates.
-    codes = {0, int(groups.size - 1), *np.flatnonzero(_codes(path)).tolist()}
-    classes = [ValueColour(k, colour, name) for k, (name, colour) in enumerate(names)]
-    return class_raster(path, classes, {code: int(groups[code]) for code in codes})
-
-
-def _codes(path: Path) -> NDArray[np.int64]:
-    """Number of cells (65536,) with each value of quality.tif."""
-    counts = np.zeros(1 << 16, np.int64)
-    with BandReader(path) as reader:
-        for strip in strips_of(reader.geobox.shape[0]):
-            counts += np.bincount(reader.read(strip).ravel(), minlength=len(counts))
-    return counts
-
-
-def _in_groups(counts: NDArray[np.int64]) -> list[int]:
-    """The values that occur, group after group as the report lists them, and in each the frequent ones first."""
-    codes = np.flatnonzero(counts)
-    order = np.lexsort((codes, -counts[codes], groups_of(codes)))
-    return [int(code) for code in codes[order]]
-
-
-def _group_of_flags(code: int) -> tuple[str, Colour]:
-    group = int(groups_of(np.array([code]))[0])
-    if group == len(FLAG_GROUPS):
-        return NO_FLAG
-    name, _, colour = FLAG_GROUPS[group]
-    return name, colour
-
-
-def _colour_of_flags(code: int) -> ValueColour:
-    names = ", ".join(str(flag.name) for flag in flags_of(code)) if code else NO_FLAG[0]
-    return ValueColour(code, _group_of_flags(code)[1], names)
 
 
 def _named(names: Mapping[Any, tuple[str, Colour]]) -> Maker:
@@ -346,7 +287,7 @@ def _table(table: int, n: int) -> list[Colour]:
 
 
 _MAKERS: dict[str, Maker] = {
-    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "quality.tif": _flags, "views.tif": _counts,
+    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "views.tif": _counts,
     "ortho.tif": _ortho, "water.tif": _named(NAMES_OF_WATER), "hillshade.tif": _hillshade,
     "contours.gpkg": _contours, "ties.gpkg": _ties, "ranking.gpkg": _ranking,
     "error.tif": _differences, "difference.tif": _differences, "significance.tif": _significances,
