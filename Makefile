@@ -77,7 +77,7 @@ qgis-plugin:
 
 # The plugin and the styles in QGIS without a window. ZLOCUS_QGIS_PICTURES names a folder for pictures to look at.
 test-qgis: $(STAMP)
-	command -v qgis_process > /dev/null || { echo "QGIS is missing: apt-get install --no-install-recommends qgis python3-qgis"; exit 1; }
+	@command -v qgis_process > /dev/null || { echo "QGIS is missing: apt-get install --no-install-recommends qgis python3-qgis"; exit 1; }
 	$(BIN)/python -m pytest -n 0 qgis/tests
 
 bench: $(STAMP)
