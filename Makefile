@@ -15,8 +15,8 @@ ROW ?= $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
 WORDS := $(wordlist 2,$(words $(MAKECMDGOALS)),$(MAKECMDGOALS))
 endif
 
-.PHONY: demo docs test test-fast test-minimum audit lint qgis-plugin test-qgis bench peers acceptance acceptance-all measure measure-all figures stale \
-    numbers release-check clean
+.PHONY: demo docs test test-fast test-minimum audit lint qgis-plugin qgis-there test-qgis bench peers acceptance \
+    acceptance-all measure measure-all figures stale numbers release-check clean
 .DEFAULT_GOAL := test
 
 # Modules are compiled by all cores, which pip would do with one; a few files of packages are templates and cannot be.
@@ -76,9 +76,11 @@ qgis-plugin:
 	$(PYTHON) qgis/package.py build/zlocus_processing.zip
 
 # The plugin and the styles in QGIS without a window. ZLOCUS_QGIS_PICTURES names a folder for pictures to look at.
-test-qgis: $(STAMP)
-	@command -v qgis_process > /dev/null || { echo "QGIS is missing: apt-get install --no-install-recommends qgis python3-qgis"; exit 1; }
+test-qgis: qgis-there $(STAMP)
 	$(BIN)/python -m pytest -n 0 qgis/tests
+
+qgis-there:
+	@command -v qgis_process > /dev/null || { echo "QGIS is missing: apt-get install --no-install-recommends qgis python3-qgis"; exit 1; }
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable --benchmark-only

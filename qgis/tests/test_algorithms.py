@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -137,6 +139,21 @@ def test_errors_are_sentences(qgis, surface, tmp_path, algorithm, values, senten
     assert sentence in said
     assert "Traceback" not in said
     assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_the_path_of_the_command_is_a_setting(qgis, surface, tmp_path):
+    """The program of the setting is run although none is on PATH."""
+    home = Path(shutil.copytree(qgis.environment["HOME"], tmp_path / "home"))
+    (settings,) = home.rglob("QGIS3.ini")
+    program = Path(sys.executable).parent / "zlocus"
+    with settings.open("a") as file:
+        file.write(f"\n[Processing]\nConfiguration\\ZLOCUS_COMMAND={program}\n")
+    words = ["run", "zlocus:products", f"--FOLDER={surface}", "--MAPS=2"]
+    done = qgis.process(*words, HOME=str(home), PATH="/usr/bin:/bin")
+    assert done.returncode == 0, done.stdout + done.stderr
+    settings.write_text(settings.read_text().replace(str(program), "/nowhere/zlocus"))
+    done = qgis.process(*words, HOME=str(home), PATH="/usr/bin:/bin")
+    assert "/nowhere/zlocus is no program. Correct the path" in done.stdout + done.stderr
 
 
 def test_a_command_that_is_missing_is_said(qgis, images, tmp_path):

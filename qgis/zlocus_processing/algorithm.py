@@ -97,6 +97,10 @@ class ZlocusAlgorithm(QgsProcessingAlgorithm):
         """The outputs of the algorithm, from what the command answered."""
         return {OUTPUT: folder}
 
+    def sentences(self, answer: dict[str, Any]) -> list[str]:
+        """What the log says at the end, from what the command answered."""
+        return []
+
     def processAlgorithm(
         self, parameters: dict[str, Any], context: QgsProcessingContext, feedback: QgsProcessingFeedback
     ) -> dict[str, Any]:
@@ -117,6 +121,8 @@ class ZlocusAlgorithm(QgsProcessingAlgorithm):
         if ended.error:
             raise QgsProcessingException(ended.error)
         feedback.setProgress(100)
+        for sentence in self.sentences(ended.answer):
+            feedback.pushInfo(sentence)
         if self.parameterAsBool(parameters, LOAD, context):
             load_on_completion(context, folder, shown_files(folder, self.SHOWN))
         return self.answered(folder, ended.answer)

@@ -21,7 +21,7 @@ from qgis.core import (
 
 from .algorithm import OUTPUT, OVERWRITE, ZlocusAlgorithm, is_empty
 from .results import EVALUATION
-from .words import WrongValue
+from .words import WrongValue, figures_in_words
 
 ALIGNMENTS = ("none", "search", "nuth-kaab")
 ALIGNMENT_NAMES = ("as it lies", "best shift removed, found by a search", "best shift removed, by Nuth and Kääb (2011)")
@@ -79,6 +79,10 @@ class Evaluate(ZlocusAlgorithm):
             "classes": self.raster(parameters, "CLASSES", context), "geoid": self.file(parameters, "GEOID", context),
             "overwrite": self.parameterAsBool(parameters, OVERWRITE, context),
         }  # fmt: skip
+
+    def sentences(self, answer: dict[str, Any]) -> list[str]:
+        """The main figures."""
+        return [figures_in_words(answer.get("all") or {})]
 
     def answered(self, folder: str, answer: dict[str, Any]) -> dict[str, Any]:
         """The folder, the map of the errors, and the main figures."""

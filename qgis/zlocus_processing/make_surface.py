@@ -158,6 +158,13 @@ class MakeSurface(ZlocusAlgorithm):
         box = self.parameterAsExtent(parameters, "EXTENT", context, crs)
         return words, (box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum())
 
+    def sentences(self, answer: dict[str, Any]) -> list[str]:
+        """How complete the surface is."""
+        coverage = answer.get("coverage")
+        if coverage is None:
+            return []
+        return [f"{100 * coverage:.1f} % of the cells seen by two images or more have a height."]
+
     def answered(self, folder: str, answer: dict[str, Any]) -> dict[str, Any]:
         """The folder, its rasters, the coverage and the report."""
         files = {name: os.path.join(folder, file) for name, file in {**RASTERS, "REPORT": "report.html"}.items()}

@@ -14,6 +14,8 @@ OF_QGIS = (
     "GDAL_PYTHON_DRIVER_PATH", "PROJ_LIB", "PROJ_DATA", "PROJ_NETWORK", "QT_PLUGIN_PATH", "LD_LIBRARY_PATH",
     "DYLD_LIBRARY_PATH", "DYLD_FRAMEWORK_PATH",
 )  # fmt: skip
+# Figures of an evaluation.
+FIGURES = {"median": "median", "NMAD": "nmad", "RMSE": "rmse", "LE90": "le90"}
 # A folder of a run is known by these files.
 RECORD, HEIGHTS = "run.json", "dsm.tif"
 
@@ -144,3 +146,11 @@ def utm_zone(longitude: float, latitude: float) -> str:
     """The UTM zone of a place on WGS 84, as EPSG:N."""
     zone = min(max(int((longitude + 180.0) // 6.0) + 1, 1), 60)
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def figures_in_words(figures: Mapping[str, Any]) -> str:
+    """The main figures of an evaluation, in metres, as far as they are known."""
+    known = [f"{name} {figures[key]:.3f} m" for name, key in FIGURES.items() if figures.get(key) is not None]
+    if figures.get("completeness") is not None:
+        known.append(f"completeness {100 * figures['completeness']:.1f} %")
+    return f"Surface less reference: {', '.join(known)}."

@@ -173,6 +173,13 @@ def test_inputs(plugin, tmp_path):
     assert words.surface_of(str(tmp_path / "dtm.tif")) == str(tmp_path / "dtm.tif")
 
 
+def test_figures_in_words(plugin):
+    figures = {"rmse": 1.23456, "median": -0.5, "nmad": None, "completeness": 0.9876}
+    assert plugin.words.figures_in_words(figures) == (
+        "Surface less reference: median -0.500 m, RMSE 1.235 m, completeness 98.8 %."
+    )
+
+
 @pytest.mark.parametrize(
     ("longitude", "latitude", "code"),
     [(8.5, 47.4, 32632), (-180.0, 0.0, 32601), (180.0, 10.0, 32660), (151.2, -33.9, 32756)],
