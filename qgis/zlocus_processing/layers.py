@@ -15,7 +15,7 @@ RANK = "zlocus/rank"
 
 
 class StyledLayer(QgsProcessingLayerPostProcessorInterface):
-    """Gives a layer its style and, where QGIS does not do it, its place in the group of its result."""
+    """Gives a layer its style, and its place in the group of its result, which QGIS before 3.32 does not know."""
 
     def __init__(self, style: str, group: str, rank: int, is_visible: bool) -> None:
         super().__init__()
@@ -36,11 +36,11 @@ class StyledLayer(QgsProcessingLayerPostProcessorInterface):
         node.setItemVisibilityChecked(self._is_visible)
         node.setExpanded(False)
         group = root.findGroup(self._group) or root.insertGroup(0, self._group)
-        if node.parent() is not group or len(group.children()) > 1:
-            moved = node.clone()
-            below = [k for k, each in enumerate(group.findLayers()) if _rank(each) > self._rank]
-            group.insertChildNode(below[0] if below else -1, moved)
-            node.parent().removeChildNode(node)
+        others = [each for each in group.findLayers() if each.layerId() != layer.id()]
+        moved = node.clone()
+        node.parent().removeChildNode(node)
+        below = [k for k, each in enumerate(others) if _rank(each) > self._rank]
+        group.insertChildNode(below[0] if below else -1, moved)
 
 
 def _rank(node: Any) -> int:
