@@ -20,7 +20,7 @@ from zlocus.matching.quality import Quality
 from zlocus.products.derived import write_derived
 from zlocus.products.report.maps import FLAG_GROUPS, NO_FLAG, groups_of
 from zlocus.products.stac_item import write_item
-from zlocus.products.styles import MAX_INDEX_CONTOURS, missing_styles, write_other_styles, write_styles
+from zlocus.products.styles import MAX_INDEX_CONTOURS, missing_styles, write_styles
 
 GRID = GeoBox((60, 80), Affine(1.0, 0, 500000, 0, -1.0, 4000000), "EPSG:32632")
 CODES = tuple(
@@ -155,14 +155,3 @@ def test_a_surface_without_any_height_has_styles_too(tmp_path):
     write_cog(tmp_path / "views.tif", np.zeros((60, 80), np.uint8), GRID, nodata=0)
     write_styles(tmp_path, ProductOptions())
     assert missing_styles(tmp_path, ProductOptions()) == ()
-
-
-def test_differences_are_drawn_about_zero(tmp_path):
-    errors = np.linspace(-0.2, 2.0, 4800, dtype=np.float32).reshape(60, 80)
-    write_cog(tmp_path / "error.tif", errors, GRID, nodata=np.nan)
-    write_other_styles(tmp_path, ["error.tif", "difference.tif", "change.json"])
-    assert sorted(os.listdir(tmp_path)) == ["error.qml", "error.sld", "error.tif"]
-    assert list(values(qml(tmp_path, "error.qml"), "item")) == [-1.9, 0.0, 1.9]
-    (tmp_path / "error.tif").unlink()
-    write_other_styles(tmp_path, ["error.tif"])
-    assert os.listdir(tmp_path) == []

@@ -39,13 +39,13 @@ def compare(options: CompareOptions, console: Console) -> Answer:
             raise ConfigError(f"{path} would be written over. Choose another folder with -o.")
     check_output(options.out, options.overwrite, COMPARISON_FILES, "comparison")
     with console.progress.stage("Comparing"):
+        from zlocus.products.other_styles import write_other_styles
         from zlocus.products.report.compare_page import (
             compared_runs,
             comparison_text,
             comparison_values,
             write_comparison,
         )
-        from zlocus.products.styles import write_other_styles
 
         comparison = compared_runs(options.first, options.second, options.geoid)
         page = write_comparison(options.out, comparison)

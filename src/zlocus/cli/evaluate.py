@@ -126,7 +126,7 @@ def evaluate(options: EvaluateOptions, console: Console) -> Answer:
     from zlocus.evaluation.evaluate import evaluate as compare
     from zlocus.evaluation.files import ERROR_MAP, write_evaluation
     from zlocus.evaluation.table import evaluation_table, main_figures_line
-    from zlocus.products.styles import write_other_styles
+    from zlocus.products.other_styles import write_other_styles
 
     comparison = Comparison(options.references[0], **arguments)
     with console.progress.stage("Comparing"):

@@ -47,7 +47,7 @@ from zlocus.matching.quality import Quality
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.surface_workers import blocks_of
 from zlocus.products.change_tables import write_change_picture, write_volumes
-from zlocus.products.styles import write_other_styles
+from zlocus.products.other_styles import write_other_styles
 
 COMMAND = "zlocus change"
 RECORD, DIFFERENCE, SIGMAS, SIGNIFICANCE, CLASSES, TABLE, LAYER, PICTURE = CHANGE_FILES

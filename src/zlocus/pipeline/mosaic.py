@@ -42,6 +42,7 @@ from zlocus.pipeline.surface_workers import blocks_of, results_of, slots_for
 from zlocus.products.blending import RunRelations, SeamKind
 from zlocus.products.mosaic_picture import PICTURE, write_picture
 from zlocus.products.mosaic_rasters import RASTERS, SOURCE, MosaicJob, MosaicRasters, OffsetJob, reaching
+from zlocus.products.other_styles import write_other_styles
 from zlocus.products.run_offsets import (
     BLOCK_CELLS,
     PairOffset,
@@ -53,7 +54,6 @@ from zlocus.products.run_offsets import (
     pair_offset,
     run_offsets,
 )
-from zlocus.products.styles import write_other_styles
 
 COMMAND = "zlocus mosaic"
 DEFAULT_FEATHER_CELLS, MIN_FEATHER_CELLS, MAX_FEATHER_CELLS = 32, 2, 256

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from rasterio.enums import MaskFlags
 
 from zlocus.core.options import ProductOptions
-from zlocus.evaluation.volumes import ChangeClass
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
-from zlocus.io.styles.file_names import OF_SURFACE, WITH_TABLE, remove_styles, style_files
+from zlocus.io.styles.file_names import OF_SURFACE, remove_styles, style_files
 from zlocus.io.styles.layer_style import (
     ClassStyle,
     Colour,
@@ -32,7 +31,6 @@ from zlocus.io.styles.layer_style import (
 )
 from zlocus.io.styles.qml import qml_of
 from zlocus.io.styles.sld import sld_of
-from zlocus.products.blending import SeamKind
 from zlocus.products.contours import contour_interval_m
 from zlocus.products.flag_styles import FlagValues
 from zlocus.products.rasters import WaterKind
@@ -55,10 +53,6 @@ HEIGHT_COLOURS: tuple[Colour, ...] = (
     (154, 200, 160), (191, 219, 165), (232, 232, 176), (240, 214, 150), (226, 183, 124), (203, 156, 117),
     (206, 181, 160), (228, 220, 213), (255, 255, 255),
 )  # fmt: skip
-# Too low, right, too high: as in the report.
-TOO_LOW, RIGHT, TOO_HIGH = (0, 0, 225), (225, 225, 225), (225, 0, 0)
-# Differences have full colours from this percentile of their size on, significances from so many sigmas on.
-SATURATED_PERCENT, SATURATED_SIGMAS = 95.0, 5.0
 # More images than this have no class each.
 MAX_COUNTS = 32
 MAX_INDEX_CONTOURS = 200
@@ -67,15 +61,6 @@ MIN_SPAN = 1e-3
 CONTOUR_MM, INDEX_CONTOUR_MM, POINT_MM = 0.15, 0.35, 1.6
 # Okabe and Ito.
 BLUE, SKY_BLUE, ORANGE, VERMILION = (0, 114, 178), (86, 180, 233), (230, 159, 0), (213, 94, 0)
-NAMES_OF_CHANGE = {
-    ChangeClass.UNCHANGED: ("no significant change", (225, 225, 225)), ChangeClass.RAISED: ("raised", (178, 24, 43)),
-    ChangeClass.LOWERED: ("lowered", (33, 102, 172)),
-}  # fmt: skip
-NAMES_OF_SEAMS = {
-    SeamKind.ONE: ("one run has a height", (225, 225, 225)),
-    SeamKind.BLENDED: ("runs agree, and are averaged", SKY_BLUE),
-    SeamKind.CHOSEN: ("runs contradict each other, and one is chosen", (200, 30, 0)),
-}  # fmt: skip
 NAMES_OF_WATER = {
     WaterKind.LEVELLED: ("levelled inside a polygon", (10, 30, 130)),
     WaterKind.POSSIBLE_LEVELLED: ("possible water, levelled", BLUE),
@@ -103,7 +88,7 @@ def write_styles(folder: Path, options: ProductOptions, renewed: Collection[str]
         return
     for product in styled_products(folder):
         if any(not (folder / name).exists() for name in style_files(product)):
-            _write_style(folder / product, options)
+            write_style(folder / product, MAKERS[product], options)
 
 
 def missing_styles(folder: Path, options: ProductOptions) -> tuple[str, ...]:
@@ -117,29 +102,14 @@ def styled_products(folder: Path) -> tuple[str, ...]:
     return tuple(name for name in OF_SURFACE if (folder / name).is_file())
 
 
-def write_other_styles(folder: Path, products: Collection[str]) -> None:
-    """Write the style files of products of other commands, in place of earlier ones; of those that are not there, the
-    earlier ones are removed.
-
-    Raises
-    ------
-    InputError, OutputError
-        See `write_styles`.
-    """
-    for product in [name for name in products if name in _MAKERS or name == WITH_TABLE]:
-        remove_styles(folder, [product])
-        if (folder / product).is_file():
-            _write_style(folder / product, ProductOptions())
+Maker = Callable[[Path, ProductOptions], LayerStyle | FlagValues]
 
 
-Maker = Callable[[Path, ProductOptions], LayerStyle]
-
-
-def _write_style(path: Path, options: ProductOptions) -> None:
-    """Write the files of a product that are missing."""
-    flags = FlagValues.of(path) if path.name == WITH_TABLE else None
-    style = flags.style() if flags is not None else _MAKERS[path.name](path, options)
-    of_flags = () if flags is None else (flags.table(), flags.reasons())
+def write_style(path: Path, make: Maker, options: ProductOptions) -> None:
+    """Write the style files of a product that are missing. make : its style, or the values of its flags."""
+    made = make(path, options)
+    style = made.style() if isinstance(made, FlagValues) else made
+    of_flags = (made.table(), made.reasons()) if isinstance(made, FlagValues) else ()
     texts = (qml_of(style), sld_of(style, path.stem), *of_flags)
     for name, text in zip(style_files(path.name), texts, strict=True):
         if not (path.parent / name).exists():
@@ -147,27 +117,18 @@ def _write_style(path: Path, options: ProductOptions) -> None:
 
 
 def _heights(path: Path, options: ProductOptions) -> RampStyle:
-    low, high = _percentiles(_sample(path), SPAN_PERCENT)
+    low, high = percentiles(sampled(path), SPAN_PERCENT)
     step = 10.0 ** (math.floor(math.log10(high - low)) - 1)
-    return _even_ramp(
+    return even_ramp(
         math.floor(low / step) * step, math.ceil(high / step) * step, HEIGHT_COLOURS, "m", is_multiplied=True
     )
 
 
 def _sigmas(path: Path, options: ProductOptions) -> RampStyle:
-    high = _round_up(_percentiles(_sample(path), SPAN_PERCENT)[1])
+    high = rounded_up(percentiles(sampled(path), SPAN_PERCENT)[1])
     # Squares give the many small values different colours, as in the report.
     values = high * np.linspace(0.0, 1.0, N_STOPS) ** 2
     return _ramp(values, _table(cv2.COLORMAP_CIVIDIS, N_STOPS), _decimals(high) + 1, "m")
-
-
-def _differences(path: Path, options: ProductOptions) -> RampStyle:
-    high = _round_up(_percentiles(np.abs(_sample(path)), (0.0, SATURATED_PERCENT))[1])
-    return _even_ramp(-high, high, (TOO_LOW, RIGHT, TOO_HIGH), "m")
-
-
-def _significances(path: Path, options: ProductOptions) -> RampStyle:
-    return _even_ramp(-SATURATED_SIGMAS, SATURATED_SIGMAS, (TOO_LOW, RIGHT, TOO_HIGH), "sigma")
 
 
 def _hillshade(path: Path, options: ProductOptions) -> StretchStyle:
@@ -179,7 +140,7 @@ def _ortho(path: Path, options: ProductOptions) -> StretchStyle:
     with open_raster(path, "raster") as file:
         bands = range(1, 4) if file.count >= 3 else range(1, 2)
         has_mask = MaskFlags.per_dataset in file.mask_flag_enums[0]
-    return StretchStyle(tuple(_percentiles(_sample(path, band), STRETCH_PERCENT) for band in bands), has_mask)
+    return StretchStyle(tuple(percentiles(sampled(path, band), STRETCH_PERCENT) for band in bands), has_mask)
 
 
 def _counts(path: Path, options: ProductOptions) -> ClassStyle | RampStyle:
@@ -193,7 +154,11 @@ def _counts(path: Path, options: ProductOptions) -> ClassStyle | RampStyle:
     return ClassStyle(tuple(ValueColour(k, colours[k - 1], f"{k} image{'s' * (k > 1)}") for k in counts))
 
 
-def _named(names: Mapping[Any, tuple[str, Colour]]) -> Maker:
+def _flags(path: Path, options: ProductOptions) -> FlagValues:
+    return FlagValues.of(path)
+
+
+def named_classes(names: Mapping[Any, tuple[str, Colour]]) -> Maker:
     """A style of classes with fixed names and colours. names : and colours, by the value of the class."""
     classes = tuple(ValueColour(int(value), colour, label) for value, (label, colour) in names.items())
     return lambda path, options: ClassStyle(classes)
@@ -239,7 +204,7 @@ def _ranking(path: Path, options: ProductOptions) -> FeatureStyle:
     return FeatureStyle("n_good", False, tuple(rules))
 
 
-def _sample(path: Path, band: int = 1) -> NDArray[np.float64]:
+def sampled(path: Path, band: int = 1) -> NDArray[np.float64]:
     """Known values (n,) of cells spread evenly over a raster, or of its overview."""
     with open_raster(path, "raster") as file:
         scale = min(SAMPLE_CELLS / max(file.shape), 1.0)
@@ -249,13 +214,13 @@ def _sample(path: Path, band: int = 1) -> NDArray[np.float64]:
     return known[np.isfinite(known)]
 
 
-def _percentiles(sample: NDArray[np.float64], percent: tuple[float, float]) -> tuple[float, float]:
+def percentiles(sample: NDArray[np.float64], percent: tuple[float, float]) -> tuple[float, float]:
     """Two percentiles of values, the second one larger; 0 and 1 without any."""
     low, high = (float(value) for value in np.percentile(sample, percent)) if sample.size else (0.0, 1.0)
     return low, high if high > low + MIN_SPAN else low + 1.0
 
 
-def _round_up(value: float) -> float:
+def rounded_up(value: float) -> float:
     """The next number with two digits that is not smaller, at least a millimetre."""
     step = 10.0 ** (math.floor(math.log10(max(value, 1e-3))) - 1)
     return math.ceil(max(value, 1e-3) / step - 1e-9) * step
@@ -266,7 +231,8 @@ def _decimals(span: float) -> int:
     return max(0, 1 - math.floor(math.log10(span)))
 
 
-def _even_ramp(low: float, high: float, colours: Sequence[Colour], unit: str, is_multiplied: bool = False) -> RampStyle:
+def even_ramp(low: float, high: float, colours: Sequence[Colour], unit: str, is_multiplied: bool = False) -> RampStyle:
+    """Colours at even distances between two values. unit : of their labels."""
     values = np.linspace(low, high, len(colours))
     return _ramp(values, colours, _decimals(high - low), unit, is_multiplied)
 
@@ -286,10 +252,8 @@ def _table(table: int, n: int) -> list[Colour]:
     return [(int(red), int(green), int(blue)) for blue, green, red in ramp(table, n)]
 
 
-_MAKERS: dict[str, Maker] = {
-    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "views.tif": _counts,
-    "ortho.tif": _ortho, "water.tif": _named(NAMES_OF_WATER), "hillshade.tif": _hillshade,
+MAKERS: dict[str, Maker] = {
+    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "quality.tif": _flags, "views.tif": _counts,
+    "ortho.tif": _ortho, "water.tif": named_classes(NAMES_OF_WATER), "hillshade.tif": _hillshade,
     "contours.gpkg": _contours, "ties.gpkg": _ties, "ranking.gpkg": _ranking,
-    "error.tif": _differences, "difference.tif": _differences, "significance.tif": _significances,
-    "class.tif": _named(NAMES_OF_CHANGE), "seams.tif": _named(NAMES_OF_SEAMS),
 }  # fmt: skip
