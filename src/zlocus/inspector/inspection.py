@@ -17,9 +17,10 @@ from zlocus.core.errors import ConfigError, GeometryError, InputError, ZlocusErr
 from zlocus.core.options import RunConfig, SelectionOptions, large_window_side
 from zlocus.core.parallel import submitted
 from zlocus.evaluation.comparison import Comparison
-from zlocus.inspector.cell import WhatIf, cell_record, masked_by, match_record
+from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
 from zlocus.inspector.layers import Layer, difference_layer, layers_of
+from zlocus.inspector.matcher_account import MatchedPart, matched_part, matcher_record, part_of
 from zlocus.inspector.queries import KINDS, MAX_VALUES, WINDOWS
 from zlocus.inspector.reference import Reference, check_comparison, reference_for
 from zlocus.inspector.restored_run import Restored, restored
@@ -97,6 +98,7 @@ class Inspection:
         self._stack = ExitStack()
         # One match at a time, because each uses the whole machine.
         self._matching = threading.Lock()
+        self._matched_part: MatchedPart | None = None
 
     def __enter__(self) -> Inspection:
         scratch = TemporaryDirectory(prefix="zlocus-inspect-", ignore_cleanup_errors=True)
@@ -119,8 +121,8 @@ class Inspection:
         # Compile or load the kernels before a user waits for them.
         for xy in found.run.ties[:: len(found.run.ties) // WARM_UP_PLACES + 1, :2]:
             try:
-                match_record(found, xy, math.nan, WhatIf())
-                break
+                if "match" in match_record(self.folder, found, xy, math.nan, WhatIf()):
+                    break
             except Exception:
                 continue  # Too few images show this place; any other one will do.
         return found
@@ -178,11 +180,35 @@ class Inspection:
         xy = self.folder.centre_of(*at)
         try:
             with self._matching:
-                record["masked_by"] = masked_by(self._scene.result(), xy, record["height_m"])
-                match = match_record(self._scene.result(), xy, record["height_m"], what_if)
+                return record | match_record(self.folder, self._scene.result(), xy, record["height_m"], what_if)
         except (GeometryError, InputError) as error:
             return record | {"error": str(error)}
-        return record | {"match": match}
+
+    def matcher(self, x: float, y: float) -> dict[str, Any]:
+        """What the matcher weighed at the cell at a ground point, m; see `matcher_record`.
+
+        The part of the run's tile that was matched again last is kept, so that the next cell in it is told at once.
+
+        Raises
+        ------
+        GeometryError
+            The point lies outside the grid, or no two images see it.
+        ConfigError
+            The scene is not open, or the run weighed no costs of cells.
+        """
+        at = self.folder.cell_of(x, y)
+        if at is None:
+            raise GeometryError("The point lies outside the surface.")
+        scene = _done(self._scene)
+        if scene is None:
+            raise ConfigError("The images are not open, so nothing can be matched again.")
+        xy = self.folder.centre_of(*at)
+        with self._matching:
+            part = self._matched_part
+            if part is None or part.core_window != part_of(scene, xy)[0]:
+                self._matched_part = None  # its arrays are given back before the next ones are made
+                part = self._matched_part = matched_part(self.folder, scene, xy)
+            return matcher_record(scene, part, self.folder, xy)
 
     def check_unchanged(self) -> None:
         """Refuse requests after the surface has changed.

@@ -23,6 +23,8 @@ Rgba = NDArray[np.uint8]
 # The range of colours is computed from a sample of this many cells a side.
 SAMPLED_SIDE = 800
 MAX_CLASSES = 12
+# Colours of heights above the DTM reach at least so far: on open ground there would be noise only.
+LEAST_TOP_M = 2.0
 OPAQUE = 255
 # Rows of a picture that are composed at a time.
 STRIP_PX = 256
@@ -49,6 +51,7 @@ def layers_of(folder: SurfaceFolder) -> dict[str, Layer]:
     layers = [_hillshade(folder)]
     layers += [_ortho(folder)] if folder.has("ortho") else []
     layers += [_height(folder), _sigma(folder), _views(folder), _quality(folder)]
+    layers += [_terrain(folder), _above_terrain(folder)] if folder.has("dtm") else []
     return {layer.name: layer for layer in layers}
 
 
@@ -145,14 +148,46 @@ def _ortho(folder: SurfaceFolder) -> Layer:
 
 def _height(folder: SurfaceFolder) -> Layer:
     low, high = maps.span(sampled(folder, "dsm").values[0])
+    legend = scale(f"{folder.height_name}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
+    return Layer("height", "Height", legend, coloured(folder, "dsm", (low, high), cv2.COLORMAP_VIRIDIS))
+
+
+def coloured(folder: SurfaceFolder, name: str, span: tuple[float, float], table: int) -> Callable[[Patch], Rgba]:
+    """Draws a raster of heights with one of OpenCV's tables of colours. span : values of its first and last colour."""
 
     def draw(patch: Patch) -> Rgba:
-        cells = read_patch(folder.path("dsm"), patch, True)
-        share = np.clip((np.nan_to_num(cells.values[0]) - low) / max(high - low, 1e-6), 0.0, 1.0)
-        return with_opacity(cv2.applyColorMap((OPAQUE * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS), cells.known)
+        cells = read_patch(folder.path(name), patch, True)
+        return with_opacity(on_ramp(cells.values[0], span, table), cells.known)
 
-    legend = scale(f"{folder.height_name}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
-    return Layer("height", "Height", legend, draw)
+    return draw
+
+
+def on_ramp(values: NDArray[Any], span: tuple[float, float], table: int) -> NDArray[np.uint8]:
+    """Colours (r, c, 3) of values (r, c) in OpenCV's order; see `coloured`."""
+    share = np.clip((np.nan_to_num(values) - span[0]) / max(span[1] - span[0], 1e-6), 0.0, 1.0)
+    return np.asarray(cv2.applyColorMap((OPAQUE * share).astype(np.uint8), table), np.uint8)
+
+
+def _terrain(folder: SurfaceFolder) -> Layer:
+    """Layer of the DTM, in the colours of the surface's heights, so that the two can be compared."""
+    low, high = maps.span(sampled(folder, "dsm").values[0])
+    legend = scale(f"DTM, {folder.height_name}, m", maps.gradient(cv2.COLORMAP_VIRIDIS), maps.even_ticks(low, high))
+    return Layer("dtm", "DTM (ground)", legend, coloured(folder, "dtm", (low, high), cv2.COLORMAP_VIRIDIS))
+
+
+def _above_terrain(folder: SurfaceFolder) -> Layer:
+    """Layer of the surface less the DTM: heights of buildings and trees."""
+    above = sampled(folder, "dsm", average=False).values[0] - sampled(folder, "dtm", average=False).values[0]
+    top = max(maps.span(above)[1], LEAST_TOP_M)
+
+    def draw(patch: Patch) -> Rgba:
+        # One cell per pixel of both: means would differ at every edge.
+        surface, ground = (read_patch(folder.path(name), patch, False) for name in ("dsm", "dtm"))
+        colours = on_ramp(surface.values[0] - ground.values[0], (0.0, top), cv2.COLORMAP_INFERNO)
+        return with_opacity(colours, surface.known & ground.known)
+
+    legend = scale("surface less DTM, m", maps.gradient(cv2.COLORMAP_INFERNO), maps.even_ticks(0.0, top))
+    return Layer("above", "Height above the DTM", legend, draw)
 
 
 def _sigma(folder: SurfaceFolder) -> Layer:

@@ -26,7 +26,7 @@ def profile(
     """Heights of the cells along a line, at least a cell apart and at `MAX_PLACES` places at most.
 
     start, end : m. Keys of the record: distance_m (n,), height_m, sigma_m, reference_m (None without a reference), each
-    None where unknown; spacing_m; length_m.
+    None where unknown; terrain_m, the DTM, None where the surface has none; spacing_m; length_m.
     """
     length = math.dist(start, end)
     n = int(np.clip(math.ceil(length / folder.cell_m) + 1, 2, MAX_PLACES))
@@ -35,9 +35,11 @@ def profile(
     cells = cells_of(folder, xy)
     height, sigma = (values_at(folder, name, cells) for name in ("dsm", "sigma"))
     true = None if reference is None else reference_at(folder, reference, cells)
+    terrain = values_at(folder, "dtm", cells) if folder.has("dtm") else None
     return {
         "distance_m": (share[:, 0] * length).round(3).tolist(), "height_m": listed(height), "sigma_m": listed(sigma),
-        "reference_m": None if true is None else listed(true), "spacing_m": length / (n - 1),
+        "reference_m": None if true is None else listed(true),
+        "terrain_m": None if terrain is None else listed(terrain), "spacing_m": length / (n - 1),
         "length_m": length,
     }  # fmt: skip
 

@@ -23,11 +23,12 @@ from starlette.types import ASGIApp
 from zlocus.core.errors import ConfigError, GeometryError, ZlocusError
 from zlocus.core.parallel import busy
 from zlocus.inspector import queries
-from zlocus.inspector.folder import Patch, read_patch
+from zlocus.inspector.folder import Patch
 from zlocus.inspector.guard import POLICY, WORDS, Guard, inline_hashes
 from zlocus.inspector.inspection import Inspection
 from zlocus.inspector.layers import Layer, composed, png_of
 from zlocus.inspector.profile import profile
+from zlocus.inspector.relief import relief_of
 from zlocus.io.run_record import finite_only
 
 THREADS = 6
@@ -71,6 +72,7 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
         Route("/static/{name:path}", of_page),
         Route("/api/state", of_state),
         Route("/api/cell", answered(inspection, cell, clicks)),
+        Route("/api/matcher", answered(inspection, matcher, clicks)),
         Route("/api/heights", answered(inspection, heights, pictures)),
         Route("/api/picture.png", answered(inspection, picture, pictures)),
         Route("/api/surface", answered(inspection, surface, others)),
@@ -134,6 +136,13 @@ def cell(inspection: Inspection, request: Request) -> Response:
     return Response(json_of(record), media_type="application/json")
 
 
+def matcher(inspection: Inspection, request: Request) -> Response:
+    """What the matcher weighed at a cell, x and y in m."""
+    values, _ = queries.once(request.query_params.multi_items(), ("x", "y"))
+    x, y = (queries.number(values, name) for name in ("x", "y"))
+    return Response(json_of(inspection.matcher(x, y)), media_type="application/json")
+
+
 def line(inspection: Inspection, request: Request) -> Response:
     """A profile from x0, y0 to x1, y1, m."""
     names = ("x0", "y0", "x1", "y1")
@@ -146,10 +155,10 @@ def line(inspection: Inspection, request: Request) -> Response:
 
 
 def heights(inspection: Inspection, request: Request) -> Response:
-    """Heights of a patch, float32, row by row, NaN where there is none."""
+    """Heights of a patch and where its surface is broken, see `Relief.content`."""
     values, _ = queries.once(request.query_params.multi_items(), queries.PATCH)
-    cells = read_patch(inspection.folder.path("dsm"), queries.patch(values), average=True)
-    return Response(cells.values[0].astype("<f4").tobytes(), media_type="application/octet-stream")
+    relief = relief_of(inspection.folder, queries.patch(values))
+    return Response(relief.content, media_type="application/octet-stream")
 
 
 def picture(inspection: Inspection, request: Request) -> Response:

@@ -79,7 +79,7 @@ def cost_volume(
     less in blocks that only two of three or more views cover. In image space both are means over the best pairs of the
     reference image, see `CountedPairs`.
     """
-    windows = np.unique([options.small_window // 2, large_window_side(options) // 2])
+    windows = half_widths(options)
     volume = np.zeros(lattice.size, np.uint8) if known_costs is None else known_costs
     parameters = cost_parameters(options, counted_pairs or CountedPairs())
     slope, evidence = SlopeArrays(slope_surface.padded(int(windows.max())), slope_surface.nodes), NO_EVIDENCE
@@ -91,6 +91,11 @@ def cost_volume(
         slope_views.arrays, slope, lattice.layout, windows, visible, parameters, evidence, volume
     )  # fmt: skip
     return volume
+
+
+def half_widths(options: CostOptions) -> NDArray[np.int64]:
+    """Half widths of the correlation windows, cells, ascending."""
+    return np.unique([options.small_window // 2, large_window_side(options) // 2])
 
 
 def cost_parameters(options: CostOptions, counted_pairs: CountedPairs) -> CostParameters:

@@ -7,7 +7,7 @@ How heights are indexed in them: see `zlocus.matching.height_lattice`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from affine import Affine
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.options import RunConfig
-from zlocus.matching.height_lattice import HeightLattice
+from zlocus.matching.height_lattice import HeightLattice, by_block
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.match_scene import MatchScene
-from zlocus.matching.occlusion import PAIR
+from zlocus.matching.occlusion import PAIR, covers
 from zlocus.matching.semiglobal import SemiGlobalHeights
 from zlocus.matching.slope_surface import CoarserSlope, SlopeSurface
 from zlocus.matching.tile_views import TileViews
@@ -155,6 +155,22 @@ class SearchPrior:
 
 
 @dataclass(frozen=True)
+class LevelSearch:
+    """What is searched at one level.
+
+    tile_views : projections of level indices; smooth : (r, c) float32 level indices, the surface known before,
+    smoothed, None where nothing is known; slope_surface : slanted support surface; slope_views : projections of slope
+    indices; lattice : search range of each block, slope indices.
+    """
+
+    tile_views: TileViews
+    smooth: NDArray[np.float32] | None
+    slope_surface: SlopeSurface
+    slope_views: TileViews
+    lattice: HeightLattice
+
+
+@dataclass(frozen=True)
 class LevelResult:
     """What one pyramid level hands to the next.
 
@@ -179,3 +195,17 @@ class LevelResult:
     all_images: int
     agreement: NDArray[np.float64] | None
     is_planar: NDArray[np.bool_] | None = None
+
+    def with_evaluations_of(self, earlier_result: LevelResult) -> LevelResult:
+        """The result with the evaluations of an earlier pass over the same level added."""
+        return replace(
+            self,
+            evaluations=earlier_result.evaluations + self.evaluations,
+            all_images=earlier_result.all_images + self.all_images,
+        )
+
+
+def count_evaluations(visible: VisibleHeights, lattice: HeightLattice) -> int:
+    """Cells x heights x views that are compared."""
+    n_covering = covers(visible).sum(axis=0, dtype=np.int32)
+    return int((by_block(n_covering, lattice.block, np.add) * lattice.count).sum())

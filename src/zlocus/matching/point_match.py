@@ -255,7 +255,8 @@ class PlaceCurves:
 
     views : those that show the place and were compared, to which the numbers in `curves` refer; lattice_index : of the
     place, in the middle of the sampled heights; heights_m : (h,) m; tile_views : all views near the place, over the
-    cells `window`; view_rows : (i,) int64, which of them `views` are.
+    cells `window`; view_rows : (i,) int64, which of them `views` are; ties : (f,) int64, numbers of the tie points that
+    order the images, as `PointOrder.features`.
     """
 
     place: Place
@@ -266,6 +267,7 @@ class PlaceCurves:
     tile_views: TileViews
     window: CellWindow
     view_rows: IntArray
+    ties: IntArray
 
     def patches(self, side: int) -> NDArray[np.float32]:
         """Windows of `side` cells around the place, (i, h, k) float32, of every view at every height.
@@ -368,7 +370,8 @@ def curves_at(
     along = lattice_index + np.arange(-options.reach_steps, options.reach_steps + 1)
     curves = point_curves(windows[view_rows], order, step_px, along, options)
     heights_m = match_scene.height_origin + along * match_scene.height_step
-    return PlaceCurves(place, compared, curves, lattice_index, heights_m, views, window, view_rows)
+    ties = pair_labels.tie[order.features]
+    return PlaceCurves(place, compared, curves, lattice_index, heights_m, views, window, view_rows, ties)
 
 
 def _tie_windows(options: SelectionOptions, max_distance_cells: int) -> list[tuple[float, OrderSource]]:

@@ -7,6 +7,7 @@ stages of one level, `match_tile` those of a tile.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,19 +20,21 @@ from zlocus.core.options.option_fields import value_of
 from zlocus.matching.break_lines import constrain
 from zlocus.matching.cost_volume import CountedPairs, cost_volume
 from zlocus.matching.edge_penalties import penalties_at_edges
-from zlocus.matching.evidence import MIN_CELLS_OF_TILE, heights_to_learn_from
+from zlocus.matching.evidence import MIN_CELLS_OF_TILE, TaughtHeights, heights_to_learn_from
 from zlocus.matching.expected_heights import expected_of_searched
 from zlocus.matching.fill import filled
 from zlocus.matching.finest_level import ortho_of_surface, refined_surface, with_planes_of_segments
 from zlocus.matching.free_rays import add_costs_of_rays
-from zlocus.matching.height_lattice import HeightLattice, by_block, search_lattice
+from zlocus.matching.height_lattice import search_lattice
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.level_records import (
     ERODE_OWN_SURFACE,
     LevelResult,
+    LevelSearch,
     PyramidLevel,
     SearchPrior,
     TileInputs,
+    count_evaluations,
 )
 from zlocus.matching.local_contrast import agreement
 from zlocus.matching.match_scene import MatchScene
@@ -69,6 +72,9 @@ from zlocus.matching.surface import Surface
 from zlocus.matching.tile_candidates import candidates_of_tile, windows_of
 from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
 from zlocus.matching.view_selection import ChosenViews, choose_views
+
+# Matches a level from a tile, the level, its search prior, the labels of pairs and the result of an earlier pass.
+MatchLevel = Callable[[TileInputs, PyramidLevel, SearchPrior, PairLabels | None, LevelResult | None], LevelResult]
 
 
 @dataclass(frozen=True)
@@ -117,17 +123,10 @@ def match_tile(
     tile = tile_inputs(match_scene, core_window, config, method, choose_images, preselect)
     if len(tile.view_numbers) < PAIR:
         return TileResult(Surface.nothing(core_window))
-    coarsest_match = match_coarsest_level(tile)
-    ground = ground_of_overlap(tile, coarsest_match)
-    coarsest_level = coarsest_match.result.level
-    overlap_window = find_overlap_window(
-        coarsest_match.result.visible, coarsest_match.result.heights.vertex, ground.covered, coarsest_level.window
-    )
-    if not core_window.at_level(coarsest_level.number, 0).meets(overlap_window):
-        return TileResult(
-            Surface.nothing(core_window), coarsest_match.result.evaluations, coarsest_match.result.all_images
-        )
-    results = match_finer_levels(tile, coarsest_match, overlap_window)
+    levels = match_all_levels(tile)
+    results, ground = levels.results, levels.ground
+    if len(results) == 1:
+        return TileResult(Surface.nothing(core_window), results[0].evaluations, results[0].all_images)
     if method != "mvll":
         results[-1] = with_planes_of_segments(results[-1], config)
     refined = refined_surface(tile, results[-1], ground)
@@ -135,7 +134,31 @@ def match_tile(
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     surface = replace(surface, ortho=ortho_of_surface(tile, results, surface, refined.lattice_index))
-    return _tile_result(tile, results, surface, coarsest_match.pair_labels)
+    return _tile_result(tile, results, surface, levels.pair_labels)
+
+
+@dataclass(frozen=True)
+class TileLevels:
+    """The matched levels of a tile.
+
+    results : the coarsest level first, and no other where it finds no overlap in the tile's core; ground : see
+    `ground_of_overlap`; pair_labels : see `CoarsestMatch`.
+    """
+
+    results: list[LevelResult]
+    ground: OverlapGround
+    pair_labels: PairLabels | None
+
+
+def match_all_levels(tile: TileInputs, match: MatchLevel | None = None) -> TileLevels:
+    """Match all levels of a tile that two views see. match : matches a finer level, None: `match_level`."""
+    coarsest_match = match_coarsest_level(tile)
+    ground = ground_of_overlap(tile, coarsest_match)
+    result, pair_labels = coarsest_match.result, coarsest_match.pair_labels
+    overlap_window = find_overlap_window(result.visible, result.heights.vertex, ground.covered, result.level.window)
+    if not tile.core_window.at_level(result.level.number, 0).meets(overlap_window):
+        return TileLevels([result], ground, pair_labels)
+    return TileLevels(match_finer_levels(tile, coarsest_match, overlap_window, match), ground, pair_labels)
 
 
 def _tile_result(
@@ -193,7 +216,7 @@ def match_coarsest_level(tile: TileInputs) -> CoarsestMatch:
         prior = coarsest_prior(tile.match_scene, level, result.heights.vertex)
         pair_labels = pair_labels_for_choice(tile, result)
     if is_steep or teaches:
-        result = add_evaluations(match_level(tile, level, prior, pair_labels, result), result)
+        result = match_level(tile, level, prior, pair_labels, result).with_evaluations_of(result)
     return CoarsestMatch(replace(result, slope_surface=_slope_of_heights(tile, result)), prior, pair_labels)
 
 
@@ -208,15 +231,6 @@ def _slope_of_heights(tile: TileInputs, result: LevelResult) -> SlopeSurface:
     """The slanted support surface that follows from the heights of the coarsest level."""
     smooth = smoothed(result.heights.vertex, tile.config.refine.jump_steps)
     return SlopeSurface.from_surface(smooth, tile.config.pyramid.block)
-
-
-def add_evaluations(result: LevelResult, earlier_result: LevelResult) -> LevelResult:
-    """A level's result with the evaluations of an earlier pass over the same level added."""
-    return replace(
-        result,
-        evaluations=earlier_result.evaluations + result.evaluations,
-        all_images=earlier_result.all_images + result.all_images,
-    )
 
 
 def pair_labels_for_choice(tile: TileInputs, coarsest_result: LevelResult | None) -> PairLabels | None:
@@ -237,10 +251,13 @@ def ground_of_overlap(tile: TileInputs, coarsest_match: CoarsestMatch) -> Overla
 
 
 def match_finer_levels(
-    tile: TileInputs, coarsest_match: CoarsestMatch, overlap_window: CellWindow
+    tile: TileInputs, coarsest_match: CoarsestMatch, overlap_window: CellWindow, match: MatchLevel | None = None
 ) -> list[LevelResult]:
-    """Match all finer levels inside a window of coarsest cells; results of all levels, the coarsest first."""
-    results, pair_labels = [coarsest_match.result], coarsest_match.pair_labels
+    """Match all finer levels inside a window of coarsest cells; results of all levels, the coarsest first.
+
+    match : matches a level, None: `match_level`.
+    """
+    match, results, pair_labels = match or match_level, [coarsest_match.result], coarsest_match.pair_labels
     level, prior, coarsest_number = (
         coarsest_match.result.level,
         coarsest_match.prior,
@@ -249,27 +266,30 @@ def match_finer_levels(
     for number in range(coarsest_number - 1, -1, -1):
         level = tile.level(number, overlap_window.finer(coarsest_number - number))
         prior = prior_from_coarser(tile, level, results[-1])
-        results.append(match_level(tile, level, prior, pair_labels, results[-1]))
+        results.append(match(tile, level, prior, pair_labels, results[-1]))
     for _ in range(1, tile.config.pyramid.finest_level_rounds if tile.handles_occlusion else 1):
         prior = replace(prior, surface=results[-1].heights.vertex, erosion=ERODE_OWN_SURFACE)
-        results[-1] = add_evaluations(match_level(tile, level, prior, pair_labels, results[-1]), results[-1])
+        results[-1] = match(tile, level, prior, pair_labels, results[-1]).with_evaluations_of(results[-1])
     return results
 
 
 @dataclass(frozen=True)
-class LevelSearch:
-    """What is searched at one level.
+class LevelCosts:
+    """The matching costs of one level, and what they were computed from.
 
-    tile_views : projections of level indices; smooth : (r, c) float32 level indices, the surface known before,
-    smoothed, None where nothing is known; slope_surface : slanted support surface; slope_views : projections of slope
-    indices; lattice : search range of each block, slope indices.
+    visible : visible height ranges of all views, slope indices; chosen_views : those that are compared;
+    taught_heights : the evidence was learned from them, None: costs are those of correlation; has_known_costs : whether
+    they contain those of the coarser level's candidates; cost : (v,) uint8, see `HeightLattice.layout`; alike : (i,)
+    see `view_agreement`.
     """
 
-    tile_views: TileViews
-    smooth: NDArray[np.float32] | None
-    slope_surface: SlopeSurface
-    slope_views: TileViews
-    lattice: HeightLattice
+    search: LevelSearch
+    visible: VisibleHeights
+    chosen_views: ChosenViews
+    taught_heights: TaughtHeights | None
+    has_known_costs: bool
+    cost: NDArray[np.uint8]
+    alike: NDArray[np.float64] | None
 
 
 def match_level(
@@ -285,6 +305,17 @@ def match_level(
     images, cost volume, semi-global heights. pair_labels : None uses all images; earlier_result : of an earlier pass
     over this level, or of the coarser one, from which the evidence is learned. None: costs are those of correlation.
     """
+    return result_of_costs(tile, level, level_costs(tile, level, prior, pair_labels, earlier_result))
+
+
+def level_costs(
+    tile: TileInputs,
+    level: PyramidLevel,
+    prior: SearchPrior,
+    pair_labels: PairLabels | None,
+    earlier_result: LevelResult | None = None,
+) -> LevelCosts:
+    """The matching costs of one level; see `match_level`."""
     config = tile.config
     search = search_along_slope(tile, level, prior, earlier_result)
     visible = visible_heights(tile, level, search, prior)
@@ -308,17 +339,24 @@ def match_level(
     )
     if tile.method != "mvll" and prior.coarser_result is None:
         add_costs_beyond_expected(cost, search.lattice, search.slope_surface, tile.match_scene, level)
-    covered = covers(visible)
-    alike = view_agreement(tile, level, search, covered, prior)
+    alike = view_agreement(tile, level, search, covers(visible), prior)
+    return LevelCosts(search, visible, chosen, taught_heights, known_costs is not None, cost, alike)
+
+
+def result_of_costs(tile: TileInputs, level: PyramidLevel, costs: LevelCosts) -> LevelResult:
+    """The result of a level from its costs, which the semi-global constraint changes."""
+    search, visible, chosen, cost, alike = (
+        costs.search, costs.visible, costs.chosen_views, costs.cost, costs.alike
+    )  # fmt: skip
     if tile.method == "mvll":
         heights = winner_takes_all_heights(cost, search.lattice)
     else:
         penalties = penalties_at_edges(
-            search.tile_views, search.smooth, covered, alike, level, config.semiglobal
+            search.tile_views, search.smooth, covers(visible), alike, level, tile.config.semiglobal
         )  # fmt: skip
         # In image space P1 is that of close objects, however many images there are.
         n_images = PAIR if tile.method == "gc3-sgm" else chosen.usual_number(level.core)
-        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, n_images, known_costs is not None)
+        heights = semiglobal_heights(tile, level, search, cost, penalties, visible, n_images, costs.has_known_costs)
     return _level_result(level, search, visible, chosen, cost, heights, alike)
 
 
@@ -458,9 +496,3 @@ def _level_result(
         all_images=all_images,
         agreement=alike,
     )
-
-
-def count_evaluations(visible: VisibleHeights, lattice: HeightLattice) -> int:
-    """Cells x heights x views that are compared."""
-    n_covering = covers(visible).sum(axis=0, dtype=np.int32)
-    return int((by_block(n_covering, lattice.block, np.add) * lattice.count).sum())
