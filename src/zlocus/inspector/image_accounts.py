@@ -23,7 +23,6 @@ from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occluders import Occluder, occluder_of
 from zlocus.matching.occlusion import EDGE_PX, MANY_VIEWS, PAIR
 from zlocus.matching.point_match import Place, PlaceCurves
-from zlocus.products.report.text import listed
 
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 # Kinds of accounts in the order of the summary, with the words of one image and of several.
@@ -34,6 +33,8 @@ KINDS = {
     "not compared": ("is not compared", "are not compared"), "outside": ("does not show it", "do not show it"),
 }  # fmt: skip
 UNLIMITED_M = math.inf
+# A cell and the eight around it. The matching erodes a surface by them before it occludes others.
+NEIGHBOURS = np.array([(0, 0), *((r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0))])
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ def summary_of(accounts: Sequence[dict[str, Any]], n_images: int) -> str:
     count = {kind: sum(account["kind"] == kind for account in accounts) for kind in KINDS}
     count["outside"] += n_images - len(accounts)
     parts = [f"{n} {KINDS[kind][n > 1]}" for kind, n in count.items() if n]
-    return f"Of {n_images} images {listed(parts)}."
+    *first, last = parts
+    return f"Of {n_images} images {', '.join(first)}{' and ' if first else ''}{last}."
 
 
 def _record(view: View, kind: str, says: str, occluder: dict[str, float] | None = None) -> dict[str, Any]:
@@ -120,12 +122,15 @@ def _beside(view: View, xyz: FloatArray, half: int) -> str | None:
     return None
 
 
-def _occluder(cell: LookedAtCell, view: View) -> Occluder | None:
-    """What of the surface occludes a cell from a view."""
+def _occluder(cell: LookedAtCell, view: View, is_eroded: bool = False) -> Occluder | None:
+    """What of the surface occludes a cell from a view. is_eroded : erode the surface first, as the matching does."""
     folder, undulation_m = cell.folder, cell.undulation_m
 
     def heights_at(xy: FloatArray) -> FloatArray:
-        return values_at(folder, "dsm", cells_of(folder, xy)) + undulation_m
+        cells = cells_of(folder, xy)
+        around = cells[None] + (NEIGHBOURS if is_eroded else NEIGHBOURS[:1])[:, None]
+        z = values_at(folder, "dsm", around.reshape(-1, 2)).reshape(around.shape[:2])
+        return np.asarray(z.min(axis=0) + undulation_m)
 
     margin_m = value_of(cell.config.cost, "occlusion_margin_steps") * cell.match_scene.height_step
     top_m = min(_highest(folder) + undulation_m, cell.match_scene.z_range[1])
@@ -161,8 +166,10 @@ def _occluded(cell: LookedAtCell, view: View, occluder: Occluder, n_compared: in
         fate = "Of two images none is left out, so it was compared all the same."
     elif n_compared >= MANY_VIEWS:
         fate = "Where so many images show a cell none is left out, but only the best pairs count."
+    elif _occluder(cell, view, is_eroded=True) is not None:
+        fate = "It is left out at this cell, unless too few images would be left."
     else:
-        fate = "It is left out at such cells, unless too few images would be left."
+        fate = "The edge is near. The matching allows for an error of one cell there, and compares it all the same."
     says = (
         f"{view.name} is occluded. It shows the surface {occluder.distance_m:.{digits}f} m away{towards}, at {first} "
         f"{x:.{digits}f}, {second} {y:.{digits}f} m. The surface there is {cell.metres(z)} high, {rise:.{digits}f} m "

@@ -19,7 +19,7 @@ from zlocus.core.parallel import submitted
 from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.cell import WhatIf, cell_record, match_record
 from zlocus.inspector.folder import SurfaceFolder, surface_folder
-from zlocus.inspector.layers import Layer, difference_layer, layers_of
+from zlocus.inspector.layers import Layer, difference_layer, extent_of, layers_of
 from zlocus.inspector.matcher_account import MatchedPart, matched_part, matcher_record, part_of
 from zlocus.inspector.queries import KINDS, MAX_VALUES, WINDOWS
 from zlocus.inspector.reference import Reference, check_comparison, reference_for
@@ -98,6 +98,8 @@ class Inspection:
         self._stack = ExitStack()
         # One match at a time, because each uses the whole machine.
         self._matching = threading.Lock()
+        # What the matcher weighed takes seconds, for which clicks do not wait.
+        self._weighing = threading.Lock()
         self._matched_part: MatchedPart | None = None
 
     def __enter__(self) -> Inspection:
@@ -203,7 +205,7 @@ class Inspection:
         if scene is None:
             raise ConfigError("The images are not open, so nothing can be matched again.")
         xy = self.folder.centre_of(*at)
-        with self._matching:
+        with self._weighing:
             part = self._matched_part
             if part is None or part.core_window != part_of(scene, xy)[0]:
                 self._matched_part = None  # its arrays are given back before the next ones are made
@@ -241,6 +243,7 @@ class Inspection:
             "title": folder.out.resolve().name, "shape": [rows, cols], "transform": list(folder.transform)[:6],
             "crs": "a local frame" if folder.is_local else folder.crs.name, "height_name": folder.height_name,
             "axes": ["x", "y"] if folder.is_local else ["E", "N"],
+            "extent": list(extent_of(folder)), "has_terrain": folder.has("dtm"),
             "levels": max(math.ceil(math.log2(max(rows, cols) / MIN_LEVEL_CELLS)), 0),
             "layers": [
                 {"name": layer.name, "title": layer.title, "legend": layer.legend} for layer in self.layers.values()

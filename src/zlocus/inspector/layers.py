@@ -117,6 +117,20 @@ def sampled(folder: SurfaceFolder, name: str, average: bool = True) -> PatchValu
     return read_patch(folder.path(name), Patch(0, 0, rows, cols, *size), average)
 
 
+def extent_of(folder: SurfaceFolder) -> tuple[int, int, int, int]:
+    """First row and column, and those after the last, of the cells with heights, as far as a sample tells them; the
+    whole grid where there are none."""
+    known = sampled(folder, "dsm", average=False).known
+    if not known.any():
+        return 0, 0, *folder.shape
+    ends = []
+    for axis, n in ((1, folder.shape[0]), (0, folder.shape[1])):
+        step, at = n / known.shape[1 - axis], np.flatnonzero(known.any(axis=axis))
+        ends.append((int(at[0] * step), min(int(np.ceil((at[-1] + 1) * step)), n)))
+    (top, bottom), (left, right) = ends
+    return top, left, bottom, right
+
+
 def _hillshade(folder: SurfaceFolder) -> Layer:
     light = folder.run["config"]["options"]["products"]
     sun_deg = light["sun_azimuth_deg"], light["sun_altitude_deg"]
@@ -238,7 +252,7 @@ def _quality(folder: SurfaceFolder) -> Layer:
         return drawn
 
     items = [(maps.css(colours[k]), meaning) for k, (meaning, *_) in enumerate(maps.FLAG_GROUPS)]
-    return Layer("quality", "Reasons", classes("reason for no height, or for a height to be checked", items), draw)
+    return Layer("quality", "Quality flags", classes("flags of quality.tif, and what they mean", items), draw)
 
 
 def reasons_of(code: int) -> list[Mapping[str, str]]:

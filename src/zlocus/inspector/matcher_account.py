@@ -91,7 +91,7 @@ def matched_part(folder: SurfaceFolder, restored: Restored, xy: FloatArray) -> M
 @dataclass(frozen=True)
 class WeighedCell:
     """A cell with its costs. part : that was matched again; undulation_m : of the vertical datum there; surface_m :
-    height in dsm.tif, NaN without one; method : of the run."""
+    height in dsm.tif, NaN without one; method : of the run; min_uniqueness : see `checks.min_uniqueness`."""
 
     costs: CellCosts
     part: MatchedPart
@@ -99,6 +99,7 @@ class WeighedCell:
     undulation_m: float
     surface_m: float
     method: str
+    min_uniqueness: float
 
     def metres(self, height_m: float) -> str:
         """An ellipsoidal height in the vertical datum of the surface, with its unit."""
@@ -129,7 +130,8 @@ def matcher_record(restored: Restored, part: MatchedPart, folder: SurfaceFolder,
         raise GeometryError("No two images see this cell, so nothing was weighed.")
     undulation_m = float(restored.run.undulation(xy[None])[0])
     method = folder.run["config"]["request"]["method"]
-    cell = WeighedCell(costs, part, match_scene, undulation_m, folder.cell(*row_col)["dsm"], method)
+    surface_m, least = folder.cell(*row_col)["dsm"], restored.config.checks.min_uniqueness
+    cell = WeighedCell(costs, part, match_scene, undulation_m, surface_m, method, least)
     says = [repeated(cell), *coarser_level(cell), evidence(cell), *constraint(cell)]
     takes_part = [number for number, sees in zip(costs.view_numbers, costs.sees, strict=True) if sees]
     return {
@@ -168,8 +170,14 @@ def coarser_level(cell: WeighedCell) -> list[str]:
     if not costs.known_cost.any():
         return [f"{found} {searched}"]
     prior, most = int(costs.known_cost[costs.chosen]), int(COST_OF_CANDIDATES.max_cost)
-    fits = "which fits what the coarser level found" if prior == 0 else "which is far from what the coarser level found"
-    return [f"{found} {searched}", f"The chosen height has a prior cost of {prior} (of {most} at most), {fits}."]
+    if prior == 0:
+        fits = "The chosen height fits what the coarser level found around the cell, so this prior adds no cost to it."
+    else:
+        fits = (
+            "The chosen height is far from what the coarser level found around the cell, so this prior adds a cost of "
+            f"{prior} to it, of {most} at most."
+        )
+    return [f"{found} {searched}", fits]
 
 
 def evidence(cell: WeighedCell) -> str:
@@ -188,17 +196,16 @@ def evidence(cell: WeighedCell) -> str:
     n_counting = sum(bool(pair.counts[costs.chosen]) for pair in seen)
     strongest = seen[int(np.abs(ratio).argmax())]
     of_all = f"Of {len(costs.pairs)} pairs of images {len(seen)} see the cell at the chosen height."
-    votes = (
-        f"{_count(n_for, 'speak')} for this height, {_count(n_against, 'speak').lower()} against it, and "
-        f"{_count(len(seen) - n_for - n_against, 'say').lower()} nothing."
-    )
+    n_silent = len(seen) - n_for - n_against
+    votes = f"{n_for or 'None'} {_verb(n_for)} for this height and {n_against or 'none'} against it."
+    votes += f" {n_silent} {'says' if n_silent == 1 else 'say'} nothing." if n_silent else ""
     which = f"The {n_counting} that speak most for it count."
     most = f"The strongest evidence is that of {cell.names(strongest)}: {_odds(strongest.log_ratio[costs.chosen])}."
     return f"{of_all} {votes} {which} {most}"
 
 
-def _count(n: int, verb: str) -> str:
-    return f"{n or 'None'} {verb}{'s' if n == 1 else ''}"
+def _verb(n: int) -> str:
+    return "speaks" if n <= 1 else "speak"
 
 
 def _odds(log_ratio: float) -> str:
@@ -229,7 +236,7 @@ def constraint(cell: WeighedCell) -> list[str]:
     if cell.method != "mvll" and math.isfinite(costs.second_m):
         parts.append(
             f"With the neighbours, the next best height is {cell.metres(costs.second_m)}. Its sum of path costs is "
-            f"larger by {costs.uniqueness}."
+            f"larger by {costs.uniqueness}. Below {cell.min_uniqueness:g} the cell is flagged AMBIGUOUS."
         )
     return parts
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from zlocus.inspector.folder import Patch, SurfaceFolder, read_patch
 from zlocus.matching.height_checks import MAX_DIFFERENCE_WITHOUT_JUMP_STEPS
 
-# Neighbouring places are not joined where their heights differ by more than a jump (as for the flag JUMP), more than
-# this slope explains (m per m), and more than so many standard deviations.
-MAX_SLOPE, SIGMAS = 1.5, 3.0
+# Neighbouring places are not joined where their heights differ by more than a jump, as for the flag JUMP, and by more
+# than this slope explains, m per m: places may be many cells apart.
+MAX_SLOPE = 1.5
 # Bits of a place: the surface is broken between it and the next one in its row, and in its column.
 TO_RIGHT, TO_BELOW = np.uint8(1), np.uint8(2)
 
@@ -33,9 +33,8 @@ class Relief:
 def relief_of(folder: SurfaceFolder, patch: Patch) -> Relief:
     """Heights and breaks of a patch of a surface."""
     heights = read_patch(folder.path("dsm"), patch, average=True).values[0].astype(np.float32)
-    sigma = read_patch(folder.path("sigma"), patch, average=True).values[0].astype(np.float32)
     spacing_m = folder.cell_m * patch.cols / patch.width, folder.cell_m * patch.rows / patch.height
-    return Relief(heights, breaks_of(heights, sigma, spacing_m, jump_m(folder)))
+    return Relief(heights, breaks_of(heights, spacing_m, jump_m(folder)))
 
 
 def jump_m(folder: SurfaceFolder) -> float:
@@ -44,20 +43,15 @@ def jump_m(folder: SurfaceFolder) -> float:
     return MAX_DIFFERENCE_WITHOUT_JUMP_STEPS * float(step_m)
 
 
-def breaks_of(
-    heights: NDArray[np.float32], sigma: NDArray[np.float32], spacing_m: tuple[float, float], jump_m: float
-) -> NDArray[np.uint8]:
+def breaks_of(heights: NDArray[np.float32], spacing_m: tuple[float, float], jump_m: float) -> NDArray[np.uint8]:
     """Where a surface is broken, (r, c) uint8, see `Relief`.
 
-    heights, sigma : (r, c) m; spacing_m : between places along a row and along a column; jump_m : see `jump_m`.
+    heights : (r, c) m; spacing_m : between places along a row and along a column; jump_m : see `jump_m`.
     """
     breaks = np.zeros(heights.shape, np.uint8)
-    variance = np.nan_to_num(sigma) ** 2
     for axis, spacing, bit in ((1, spacing_m[0], TO_RIGHT), (0, spacing_m[1], TO_BELOW)):
         here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis else (np.s_[:-1], np.s_[1:])
-        noise_m = SIGMAS * np.sqrt(variance[here] + variance[there])
-        limit_m = np.maximum(noise_m, max(jump_m, MAX_SLOPE * spacing))
         with np.errstate(invalid="ignore"):
-            is_broken = np.abs(heights[here] - heights[there]) > limit_m
+            is_broken = np.abs(heights[here] - heights[there]) > max(jump_m, MAX_SLOPE * spacing)
         breaks[here] |= np.where(is_broken, bit, np.uint8(0))
     return breaks

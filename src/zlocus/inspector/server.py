@@ -59,7 +59,9 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
     """The web application of an inspection. hosts : "host:port" at which browsers open it."""
     static = page_files()
     # Clicks and pictures each have one slot, so that an abandoned one does not delay the other requests.
-    clicks, pictures, others = CapacityLimiter(1), CapacityLimiter(1), CapacityLimiter(THREADS)
+    # So do the matches of what the matcher weighed, which take seconds.
+    clicks, weighed, pictures = CapacityLimiter(1), CapacityLimiter(1), CapacityLimiter(1)
+    others = CapacityLimiter(THREADS)
 
     async def of_page(request: Request) -> Response:
         return file_of(static, request.path_params.get("name", "index.html"))
@@ -72,7 +74,7 @@ def application(inspection: Inspection, token: str, hosts: frozenset[str]) -> AS
         Route("/static/{name:path}", of_page),
         Route("/api/state", of_state),
         Route("/api/cell", answered(inspection, cell, clicks)),
-        Route("/api/matcher", answered(inspection, matcher, clicks)),
+        Route("/api/matcher", answered(inspection, matcher, weighed)),
         Route("/api/heights", answered(inspection, heights, pictures)),
         Route("/api/picture.png", answered(inspection, picture, pictures)),
         Route("/api/surface", answered(inspection, surface, others)),

@@ -1,5 +1,6 @@
 // The panel of one cell: its values in the surface, its match, and its match with other settings.
 
+import * as accounts from "./accounts.js";
 import { asked, Refused } from "./api.js";
 import * as curves from "./curves.js";
 import { $, digitsFor, element, metres, notice, signed } from "./dom.js";
@@ -10,6 +11,13 @@ import * as windows from "./windows.js";
 
 const MAX_LISTED = 100;
 const LABELS = { 1: "good", 0: "fair", "-1": "poor" };
+// Columns of the table of images, and what they mean.
+const HEADS = [
+  ["use, image", "Switch an image off to match the cell without it"], ["match", "Label of the match curve with the reference image"],
+  ["highest ρ", "Highest correlation with the reference image"], ["ratio", "Highest correlation over that of the second peak"],
+  ["peak, m", "Height of the highest correlation"], ["labels", "Sum of the labels at the tie points around"],
+  ["mean", "Label of the mean of this and the images above it"], ["σ, m", "Predicted standard deviation of the peak of that mean"],
+];
 const WAIT_MS = 700;
 // While a key or a spinner is held, only the last of many cells is requested.
 const REST_MS = 60;
@@ -49,6 +57,7 @@ function words(id) {
   const lines = id === "ncc" ? shown.match.curves.map(({ image }, j) => ({ text: `${j + 1}. ${image}`, colour: curves.lineColour(j) })) : [];
   const below = $(`${id}-figure`).querySelector(":scope > p.aside")?.textContent.replace(/\s+/g, " ").trim();
   if (below) lines.push({ text: below });
+  if (id === "windows") lines.push(...accounts.sentences().map((text) => ({ text })));
   if (["windows", "ncc", "sncc"].includes(id)) lines.push({ text: `selected height: ${$("height-value").textContent}` });
   const title = `${$(`${id}-figure`).querySelector("figcaption span").textContent}, reference ${shown.match.reference}`;
   return { title, subtitle: `${surface.title}, row ${shown.row}, column ${shown.col} (${map.words(shown.x, shown.y)})`, lines };
@@ -89,6 +98,7 @@ export async function open() {
   drawn.clearLayers();
   if (!at) {
     shown = null;
+    accounts.clear();
     if (state.get("cell")) notice(`The link does not name a place: cell=${state.get("cell")}.`);
     return;
   }
@@ -127,6 +137,7 @@ async function load([x, y], signal) {
   shown = record;
   facts(record);
   mark(record);
+  accounts.show(record);
   if (record.match) {
     $("cell-error").hidden = true;
     $("match").hidden = false;
@@ -141,6 +152,7 @@ async function load([x, y], signal) {
 // Nothing of the previous cell stays beside an error message.
 function fail(text) {
   shown = null;
+  accounts.clear();
   for (const id of ["cell-facts", "cell-reasons"]) $(id).replaceChildren();
   noMatch(text);
 }
@@ -164,6 +176,7 @@ function facts(record) {
     ["Standard deviation", metres(record.sigma_m, digits() + 1)],
     ["Images used", record.height_m === null ? "–" : String(record.n_images)],
   ];
+  if (record.above_terrain_m !== null) rows.push(["Height above the DTM", metres(record.above_terrain_m, digits())]);
   if (record.difference_m !== null) rows.push(["Surface less reference", `${signed(Number(record.difference_m.toFixed(digits())))} m`]);
   const ids = { Height: "cell-height", "Standard deviation": "cell-sigma", "Images used": "cell-images", "Surface less reference": "cell-difference" };
   $("cell-facts").replaceChildren(
@@ -171,7 +184,7 @@ function facts(record) {
   );
   // A cell without a height shows only the reasons for that.
   const said = record.height_m === null ? record.reasons.filter(({ fate }) => fate === "none") : record.reasons;
-  $("cell-reasons").replaceChildren(...said.map(reason), ...masks(record.masked_by ?? []));
+  $("cell-reasons").replaceChildren(...said.map(reason));
 }
 
 // Decimals of heights, which are at best precise to a tenth of a cell.
@@ -179,14 +192,13 @@ function digits() {
   return digitsFor(surface.transform[0]);
 }
 
-// The images whose masks cover the cell.
-function masks(names) {
-  return names.map((name) => element("li", {}, "The mask of ", element("b", {}, name), " covers the cell."));
+function reason({ name, meaning, fate, advice }) {
+  const said = [capital(meaning), fate === "none" ? "So there is no height" : "", capital(advice)].filter(Boolean);
+  return element("li", {}, element("b", {}, name), ` ${said.map((part) => `${part}.`).join(" ")}`);
 }
 
-function reason({ name, meaning, fate, advice }) {
-  const said = [meaning, fate === "none" ? "so there is no height" : "", advice].filter(Boolean).join("; ");
-  return element("li", {}, element("b", {}, name), `: ${said}.`);
+function capital(text) {
+  return text && text[0].toUpperCase() + text.slice(1);
 }
 
 // The cell, and the tie points that order its images, on the map.
@@ -206,7 +218,7 @@ function mark(record) {
   for (const point of around.points) {
     const sum = point.labels.reduce((one, other) => one + other, 0);
     L.circleMarker([point.y, point.x], { radius: 5, weight: 1.5, color: "#fff", fillColor: windows.inkOf(Math.sign(sum)), fillOpacity: 1 })
-      .bindTooltip(`Tie point ${point.distance_m.toFixed(1)} m away: ${point.labels.map(signed).join(", ")}`).addTo(drawn)
+      .bindTooltip(`${point.says}<br>${point.labels_say}`).addTo(drawn)
       .getElement().setAttribute("tabindex", "-1");
   }
 }
@@ -214,9 +226,9 @@ function mark(record) {
 function match(found, before) {
   unpacked = windows.unpack(found);
   const reference = shown.difference_m === null ? null : shown.height_m - shown.difference_m;
-  $("match-stop").textContent = `${found.says.stop} ${peak(found)} One step of height is ${metres(found.step_m, digitsFor(found.step_m) + 1)}.`;
+  $("match-stop").textContent = `${peak(found)} ${found.says.stop} One step of height is ${metres(found.step_m, digitsFor(found.step_m) + 1)}.`;
   $("match-run").textContent = `${apart(found)}${ofRun(found)}`;
-  $("match-order").textContent = `The labels come from ${found.says.order}. ${howOrdered()} A line is drawn below the last image that is used.`;
+  $("match-order").textContent = `Each image gets a label at every tie point around: good, fair or poor, as it matches the reference image there. The labels come from ${found.says.order}. ${howOrdered()} The blue line is drawn below the last image that is used.`;
   draw("ncc", curves.single(found, reference), key(found, reference));
   draw("sncc", curves.means(found, before, reference), before ? element("p", { class: "aside" }, "dashed in colour: the mean with which the match ends with the options of the run") : null);
   const columns = Math.max(2, Math.floor(($("windows-figure").clientWidth || 500) / 118));
@@ -244,10 +256,11 @@ function apart(found) {
   const away = shown.height_m - found.peak_m, reasons = shown.reasons.map(({ name }) => name);
   if (Math.abs(away) < 1.5 * found.step_m) return "";
   const [low, high] = [found.heights_m[0], found.heights_m.at(-1)];
-  const atEnd = Math.min(found.peak_m - low, high - found.peak_m) < 1.5 * found.step_m ? " (which lies at an end of the candidate heights and is therefore not reliable)" : "";
-  const why = reasons.includes("PLANE") ? "its height is that of the plane fitted to the whole segment" :
-    reasons.includes("FILLED") ? "its height was interpolated from the neighbours" : "the semi-global constraint, other correlation windows or other images led to another height than this cell without its neighbours";
-  return `The surface lies ${metres(Math.abs(away))} ${away > 0 ? "above" : "below"} this peak${atEnd}: ${why}. `;
+  const isAtEnd = Math.min(found.peak_m - low, high - found.peak_m) < 1.5 * found.step_m;
+  const why = reasons.includes("PLANE") ? "Its height is that of the plane fitted to the whole segment." :
+    reasons.includes("FILLED") ? "Its height was interpolated from the neighbours." :
+    "The neighbouring cells, smaller windows or other images led to another height than this cell alone.";
+  return `The surface lies ${metres(Math.abs(away))} ${away > 0 ? "above" : "below"} this peak. ${isAtEnd ? "The peak lies at an end of the heights compared, so that it is not reliable. " : ""}${why} `;
 }
 
 function howOrdered() {
@@ -260,17 +273,16 @@ function howOrdered() {
 // Differences between the run and the match of a single cell.
 function ofRun(found) {
   if (surface.method === "gc3-sgm") {
-    return "The run matched the pixels of the images (gc3-sgm); The curves are those of the vertical line through the cell.";
+    return "The run matched the pixels of the images (gc3-sgm). The curves are those of the vertical line through the cell.";
   }
-  const window = `${found.window} x ${found.window}`;
-  const used = shown.height_m === null ? "" : `In the run ${shown.n_images} of ${surface.images.length} images, including the reference image, were used for the final height. Images in which the cell is occluded were not used. `;
-  const curves_text = ` These curves use correlation windows of ${window} cells. The run also uses smaller windows and grey values` +
-    (surface.method === "mvll" ? "." : ", and the semi-global constraint, so that its height need not lie at this peak.");
+  const window = `${found.window} × ${found.window}`;
+  const used = shown.height_m === null ? "" : `The run measured the final height with ${shown.n_images} of ${surface.images.length} images, the reference image included. It left out images in which the cell is occluded. `;
+  const constraint = surface.method === "mvll" ? "" : " It also applies the semi-global constraint, which makes neighbouring cells agree.";
+  const curves_text = ` These curves use windows of ${window} cells. The run also uses smaller windows and grey values.${constraint}`;
   if (surface.selection !== "guided") {
-    return `${used}The run leaves out none for its match curve: order and stop are those that the rule of ` +
-      `--selection guided gives for this single cell.${curves_text}`;
+    return `${used}The run compares all images. Order and stop are those that --selection guided would give this cell.${curves_text}`;
   }
-  return `${used}It applies the same rule to matching blocks, on the next coarser pyramid level.${curves_text}`;
+  return `${used}The run chooses the images by the same rule, for blocks of cells of the next coarser level.${curves_text}`;
 }
 
 function nearest(found, height) {
@@ -298,7 +310,7 @@ function moved(isAsked) {
   $("height-value").textContent = text;
   $("height").setAttribute("aria-valuetext", text);
   const each = found.curves.map(({ image }, j) => `${image} ${correlation(found.ncc[j][k])}`);
-  $("height-text").textContent = `At this height: mean of ${found.stop.images} ${correlation(found.sncc[found.stop.images - 1][k])}; ${each.join(", ")}`;
+  $("height-text").textContent = `At this height the mean correlation of ${found.stop.images === 1 ? "the first image" : `the first ${found.stop.images} images`} is ${correlation(found.sncc[found.stop.images - 1][k])}. Of each image: ${each.join(", ")}.`;
   curves.mark(charts.ncc, found, k);
   curves.mark(charts.sncc, found, k);
   windows.show(charts.windows, found, unpacked, "moving", k);
@@ -316,8 +328,7 @@ export function slide(by) {
 }
 
 function imageTable(found) {
-  const heads = ["use, image", "label", "ρ1", "ratio", "peak m", "around", "mean", "σ m"];
-  const rows = [element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))];
+  const rows = [element("tr", {}, ...HEADS.map(([head, meaning]) => element("th", { scope: "col", title: meaning }, head)))];
   const order = found?.curves.map((curve) => curve.image) ?? [];
   if (found) rows.push(imageRow(found.reference, ["reference image", "", "", "", "", "", ""]));
   order.forEach((name, j) => {
@@ -367,15 +378,18 @@ function text(value, digits, what, hasPeak = true) {
 }
 
 function label(value, name, what) {
-  return element("td", { class: `label-${value}`, "data-value": what }, `${signed(value)} ${LABELS[value]}`);
+  return element("td", { class: `label-${value}`, "data-value": what }, `${LABELS[value]} (${signed(value)})`);
 }
 
 function tieTable(found) {
-  const { points } = found.neighbours;
-  const caption = element("caption", { class: "hidden" }, "Labels of the images at tie points around the cell");
-  const heads = ["distance", ...found.curves.map(({ image }) => image)];
-  const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, `${point.distance_m.toFixed(digitsFor(surface.transform[0]) - 1)} m`),
-    ...point.labels.map((value) => element("td", { class: `label-${value}` }, signed(value)))));
+  const { points } = found.neighbours, decimals = digitsFor(surface.transform[0]);
+  $("ties-say").textContent = found.neighbours.says;
+  const caption = element("caption", { class: "hidden" }, "Heights of the tie points around the cell, and how well the images match there");
+  const heads = ["away, m", "height, m", "above surface, m", ...found.curves.map(({ image }) => image)];
+  const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, point.distance_m.toFixed(decimals - 1)),
+    element("td", {}, point.height_m.toFixed(decimals)),
+    element("td", {}, point.above_surface_m === null ? "–" : signed(point.above_surface_m.toFixed(decimals))),
+    ...point.labels.map((value) => element("td", { class: `label-${value}` }, LABELS[value]))));
   if (points.length > rows.length) rows.push(element("tr", {}, element("td", {}, `and ${points.length - rows.length} more`)));
   if (!points.length) rows.push(element("tr", {}, element("td", {}, "none is near enough")));
   $("ties").replaceChildren(caption, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);

@@ -90,3 +90,21 @@ export function mark(svg, match, k) {
   line.attr("class", "selected-height").attr("x1", x).attr("x2", x).attr("y1", SIZE.marginTop).attr("y2", SIZE.height - SIZE.marginBottom)
     .attr("stroke", colour("accent")).attr("stroke-width", 2).attr("pointer-events", "none");
 }
+
+// Costs of a cell by height: all of them as a line, those of the coarser level as an area.
+export function costs({ heights_m, cost, known_cost, chosen }) {
+  const points = heights_m.map((height, k) => ({ height, cost: cost[k], known: known_cost[k] }));
+  return Plot.plot({
+    ...SIZE, height: 200, ariaLabel: "Cost against height", style: { fontSize: "12px", background: "transparent" },
+    x: { domain: [heights_m[0], heights_m.at(-1)], label: "height, m", labelAnchor: "center", labelArrow: "none" },
+    y: { domain: [0, 255], label: "cost", ticks: [0, 50, 100, 150, 200, 250], labelArrow: "none" },
+    marks: [
+      Plot.areaY(points, { x: "height", y: "known", fill: colour("accent"), fillOpacity: 0.25 }),
+      Plot.line(points, { x: "height", y: "cost", stroke: "currentColor", strokeWidth: 1.6 }),
+      Plot.ruleX([heights_m[chosen]], { stroke: colour("accent"), strokeWidth: 2 }),
+      Plot.tip(points, Plot.pointerX({
+        x: "height", y: "cost", fill: colour("raised"), stroke: colour("line"), title: (d) => `cost ${d.cost} at ${d.height.toFixed(2)} m`,
+      })),
+    ],
+  });
+}

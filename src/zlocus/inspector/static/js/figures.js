@@ -7,7 +7,7 @@ const SCALE = 2;
 // Add buttons that save a figure. svg, name, words : functions that return the current drawing, if there is one, the name
 // of its file, and its title and legend.
 export function exportable(figure, name, svg, words) {
-  const buttons = element("span", {}), title = figure.querySelector("figcaption span").textContent;
+  const buttons = element("span", { class: "save" }, "Save as"), title = figure.querySelector("figcaption span").textContent;
   for (const kind of ["SVG", "PNG"]) {
     const save = () => {
       if (!svg()) return;

@@ -1,7 +1,9 @@
 // The page: opens the view that the address names, and handles keys and buttons.
 
+import * as accounts from "./accounts.js";
 import { asked } from "./api.js";
 import * as cell from "./cell.js";
+import { isDark } from "./curves.js";
 import { $, element, notice } from "./dom.js";
 import { saveCanvas } from "./figures.js";
 import * as map from "./map.js";
@@ -11,7 +13,7 @@ import * as state from "./state.js";
 const LETTERS = "zlocus.letters";
 const TABS = ["cell", "profile", "relief"];
 const KEYS = [
-  ["1 to 7", "switch the layer with this number on or off"],
+  ["1 to 9", "switch the layer with this number on or off"],
   ["Arrows, + and −", "move the map and zoom, while it has the focus; the same for the view in three dimensions, which Shift and arrows turn"],
   ["Enter", "open the cell in the middle of the map"],
   ["Shift and arrows", "open the neighbouring cell"],
@@ -20,6 +22,7 @@ const KEYS = [
   ["Esc", "stop drawing"],
   ["H", "show the whole surface"],
   ["C, F, V", "open cell, profile or 3-D view"],
+  ["X", "close them, and show the map alone"],
   ["L", "copy the link of this view"],
   ["D", "switch between light and dark"],
   ["?", "show this list"],
@@ -36,11 +39,13 @@ async function start() {
   $("subtitle").textContent = `${rows} × ${cols} cells of ${surface.transform[0]} m, ${surface.images.length} images, ${surface.crs}`;
   leaflet = map.make(surface);
   cell.make(surface, leaflet);
+  accounts.make(surface, leaflet);
   profile.make(surface, leaflet);
   makeGo();
   makeKeys();
   leaflet.on("click", ({ latlng }) => clicked(latlng));
   TABS.forEach((name) => $(`tab-${name}`).addEventListener("click", () => open(name)));
+  $("close").addEventListener("click", close);
   $("tab-cell").parentElement.addEventListener("keydown", moveTab);
   $("link").addEventListener("click", copyLink);
   $("theme").addEventListener("click", changeTheme);
@@ -56,7 +61,10 @@ async function start() {
   $("letters").checked = localStorage.getItem(LETTERS) !== "off";
   $("letters").addEventListener("change", () => localStorage.setItem(LETTERS, $("letters").checked ? "on" : "off"));
   addEventListener("pointerdown", () => delete document.body.dataset.keys, true);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    theme(state.get("theme"));
+    redraw();
+  });
   state.onOpened(reopen);
   reopen();
   document.body.dataset.ready = "true";
@@ -69,7 +77,9 @@ function reopen() {
   const tab = state.get("tab");
   cell.open();
   profile.open();
-  open(TABS.includes(tab) ? tab : "cell", false);
+  if (TABS.includes(tab)) open(tab, false);
+  else if (state.get("cell")) open("cell", false);
+  else close();
 }
 
 // Poll the server until everything that is prepared in the background is ready.
@@ -89,6 +99,7 @@ async function watch() {
     if (found.reference?.is === "opening") waiting.push("The reference is being compared.");
     notice([...failed, ...waiting, ...found.notes].join(" "));
     $("comparison").textContent = found.comparison ?? "";
+    $("comparison-part").hidden = !found.comparison;
     if (found.difference && !map.has("difference")) {
       map.addLate(found.difference);
       cell.open();
@@ -101,7 +112,7 @@ async function watch() {
 }
 
 function clicked(latlng) {
-  if (!$("profile").hidden) profile.point(latlng);
+  if (!$("panel").hidden && !$("profile").hidden) profile.point(latlng);
   else inspect(latlng);
 }
 
@@ -110,12 +121,26 @@ function inspect({ lat, lng }) {
   cell.look(lng, lat);
 }
 
-async function open(name, isAsked = true) {
+// Show one of the tabs beside the map, or with null the map alone.
+function select(name) {
+  $("panel").hidden = name === null;
+  if (name === null) delete document.body.dataset.panel;
+  else document.body.dataset.panel = "open";
   for (const each of TABS) {
     $(each).hidden = each !== name;
     $(`tab-${each}`).setAttribute("aria-selected", String(each === name));
-    $(`tab-${each}`).tabIndex = each === name ? 0 : -1;
+    $(`tab-${each}`).tabIndex = each === (name ?? TABS[0]) ? 0 : -1;
   }
+}
+
+function close() {
+  select(null);
+  profile.cancel();
+  state.set({ tab: null });
+}
+
+async function open(name, isAsked = true) {
+  select(name);
   if (isAsked) state.set({ tab: name });
   if (name !== "profile") profile.cancel();
   if (name === "profile" && !state.get("line")) profile.begin();
@@ -137,7 +162,7 @@ async function open(name, isAsked = true) {
 function moveTab(event) {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
   if (!step) return;
-  const at = TABS.findIndex((name) => $(`tab-${name}`).getAttribute("aria-selected") === "true");
+  const at = TABS.findIndex((name) => $(`tab-${name}`).tabIndex === 0);
   const next = TABS[(at + step + TABS.length) % TABS.length];
   open(next);
   $(`tab-${next}`).focus();
@@ -175,7 +200,7 @@ function key(event) {
   else if (event.key === "Escape") profile.cancel();
   else if (event.key === "?") $("keys").showModal();
   else {
-    const action = { c: () => open("cell"), f: () => open("profile"), v: () => open("relief"), h: map.home, l: copyLink, d: changeTheme, p: profilePoint }[event.key.toLowerCase()];
+    const action = { c: () => open("cell"), f: () => open("profile"), v: () => open("relief"), x: close, h: map.home, l: copyLink, d: changeTheme, p: profilePoint }[event.key.toLowerCase()];
     if (!action) return;
     action();
   }
@@ -188,7 +213,7 @@ function centre() {
 }
 
 function profilePoint() {
-  if ($("profile").hidden) open("profile");
+  if ($("panel").hidden || $("profile").hidden) open("profile");
   profile.point(leaflet.getCenter());
 }
 
@@ -203,7 +228,7 @@ async function copyLink() {
 }
 
 function flash(text) {
-  const before = $("link").textContent;
+  const before = "Copy link";
   $("link").textContent = text;
   setTimeout(() => ($("link").textContent = before), 1200);
 }
@@ -211,18 +236,18 @@ function flash(text) {
 function theme(name) {
   if (name === "light" || name === "dark") document.documentElement.dataset.theme = name;
   else delete document.documentElement.dataset.theme;
+  $("theme").textContent = isDark() ? "Light" : "Dark";
 }
 
 function changeTheme() {
-  const isDark = getComputedStyle(document.documentElement).getPropertyValue("color-scheme") === "dark" ||
-    (!document.documentElement.dataset.theme && matchMedia("(prefers-color-scheme: dark)").matches);
-  state.set({ theme: isDark ? "light" : "dark" });
+  state.set({ theme: isDark() ? "light" : "dark" });
   theme(state.get("theme"));
   redraw();
 }
 
 function redraw() {
   cell.redraw();
+  accounts.redraw();
   profile.redraw();
   relief?.then((found) => found.draw());
 }

@@ -6,7 +6,13 @@ import * as state from "./state.js";
 
 const TILE_PX = 256;
 const CLOSEST = 6;
+// As in the style sheet.
+const NARROW = "(max-width: 860px)";
 const DEFAULT_LAYERS = { hillshade: 1, height: 0.55 };
+// Beside the surface, when the whole of it is shown, px.
+const MARGIN_PX = 10;
+// Whether the whole surface is shown, so that it is fitted again when the window changes; and whether that is going on.
+let isHome = false, isFitting = false;
 let surface, map, crs;
 const layers = new Map();
 
@@ -22,25 +28,36 @@ export function make(about) {
   const [a, , c, , e, f] = about.transform;
   crs = L.extend({}, L.CRS.Simple, { transformation: new L.Transformation(1 / a, -c / a, 1 / e, -f / e) });
   map = L.map("map", {
-    crs, minZoom: -about.levels - 1, maxZoom: CLOSEST, zoomSnap: 0.5, zoomDelta: 1, attributionControl: false,
+    crs, minZoom: -about.levels - 1, maxZoom: CLOSEST, zoomSnap: 0, zoomDelta: 1, attributionControl: false,
     wheelPxPerZoomLevel: 90, keyboardPanDelta: 120,
   });
   L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
   about.layers.forEach(addLayer);
-  // Limit the zoom so that the surface stays visible.
-  map.setMinZoom(Math.min(map.getBoundsZoom(bounds()) - 1, 0));
+  // Limit the zoom so that the surface stays visible, in a small window too.
+  map.setMinZoom(Math.min(map.getBoundsZoom(bounds()) - 2, 0));
   map.setMaxBounds(bounds().pad(1));
-  if (matchMedia("(max-width: 860px)").matches) $("layers").open = false;
+  if (matchMedia(NARROW).matches) $("layers").open = false;
   openView();
+  $("no-terrain").hidden = about.has_terrain;
   map.on("moveend", () => {
+    if (isFitting) return;
+    isHome = false;
     const { lat, lng } = map.getCenter();
     state.set({ at: [place(lng), place(lat), map.getZoom()].join(",") });
     if (document.body.dataset.keys) $("pointer").textContent = words(lng, lat);
   });
   map.on("mousemove", ({ latlng }) => ($("pointer").textContent = words(latlng.lng, latlng.lat)));
   map.on("mouseout move", () => ($("pointer").textContent = ""));
-  new ResizeObserver(() => map.invalidateSize()).observe($("map"));
+  new ResizeObserver(resized).observe($("map"));
   return map;
+}
+
+// The window, or the panel, has another size: the whole surface stays whole, and another place stays in the middle.
+function resized() {
+  isFitting = true;
+  map.invalidateSize({ animate: false });
+  isFitting = false;
+  if (isHome) home();
 }
 
 // A coordinate as links contain it, to a tenth of a cell.
@@ -56,8 +73,10 @@ export function words(x, y, digits = digitsFor(surface.transform[0]) - 1) {
 // Show the place and the layers that the address names.
 export function openView() {
   const at = state.numbers("at", 3);
-  if (at && bounds().pad(1).contains([at[1], at[0]])) map.setView([at[1], at[0]], at[2], { animate: false });
-  else home();
+  if (at && bounds().pad(1).contains([at[1], at[0]])) {
+    isHome = false;
+    map.setView([at[1], at[0]], at[2], { animate: false });
+  } else home();
   const asked = state.get("layers");
   const shown = asked === undefined || asked === null ? DEFAULT_LAYERS : parsed(asked);
   for (const layer of layers.values()) show(layer, shown[layer.name]);
@@ -85,11 +104,23 @@ export function holds(x, y) {
   return x >= box.getWest() && x < box.getEast() && y > box.getSouth() && y <= box.getNorth();
 }
 
-// Show the whole surface.
+// Show the whole surface, as large as the map has room for it.
 export function home() {
-  // Leave room for the list of layers, where the map is wide enough.
-  const list = $("layers"), aside = list.open && list.offsetWidth < $("map").clientWidth / 2 ? list.offsetWidth : 0;
-  map.fitBounds(bounds(), { animate: false, paddingBottomRight: [aside, 0] });
+  const list = $("layers").getBoundingClientRect(), legend = $("legends").getBoundingClientRect(), frame = $("map").getBoundingClientRect();
+  // The list of layers stands beside it where the map is wide, and the legend below it where the map is narrow.
+  const isWide = !matchMedia(NARROW).matches;
+  const aside = isWide && $("layers").open ? frame.right - list.left : 0, below = isWide || !legend.height ? 0 : frame.bottom - legend.top;
+  isFitting = true;
+  map.fitBounds(extent(), { animate: false, paddingTopLeft: [MARGIN_PX, MARGIN_PX], paddingBottomRight: [aside + MARGIN_PX, below + MARGIN_PX] });
+  isFitting = false;
+  isHome = true;
+  state.set({ at: null });
+}
+
+// The box of the cells that have heights.
+function extent() {
+  const [top, left, bottom, right] = surface.extent, [a, , c, , e, f] = surface.transform;
+  return L.latLngBounds([f + bottom * e, c + left * a], [f + top * e, c + right * a]);
 }
 
 export function bounds() {
@@ -134,10 +165,17 @@ function show(layer, share) {
   layer.box.checked = share !== undefined;
   if (share !== undefined) layer.share.value = share;
   layer.share.disabled = !layer.box.checked;
-  layer.legend.hidden = !layer.box.checked;
+  layer.legend.hidden = !layer.box.checked || !layer.drawnLegend;
+  markTop();
   layer.tiles.setOpacity(Number(layer.share.value));
   if (layer.box.checked) layer.tiles.addTo(map);
   else layer.tiles.remove();
+}
+
+// Where there is room for one legend only, it is that of the highest layer.
+function markTop() {
+  const all = [...document.querySelectorAll("#legends .legend")], first = all.find((each) => !each.hidden);
+  all.forEach((each) => each.classList.toggle("top", each === first));
 }
 
 function changed(layer) {
@@ -164,7 +202,7 @@ export function titles() {
 }
 
 function legendOf({ legend }) {
-  if (!legend) return element("div", {});
+  if (!legend) return element("div", { class: "legend", hidden: true });
   const box = element("div", { class: "legend" }, element("b", {}, legend.title));
   if (legend.kind === "scale") {
     box.append(element("div", { class: "bar", style: `background: linear-gradient(to right, ${legend.gradient})` }));

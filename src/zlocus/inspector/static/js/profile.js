@@ -82,10 +82,10 @@ export function redraw() {
 
 function draw([x0, y0, x1, y1]) {
   const points = last.distance_m.map((distance, i) => ({
-    distance, height: last.height_m[i], sigma: last.sigma_m[i], reference: last.reference_m?.[i] ?? null,
+    distance, height: last.height_m[i], sigma: last.sigma_m[i], reference: last.reference_m?.[i] ?? null, terrain: last.terrain_m?.[i] ?? null,
   }));
   const known = points.filter((each) => each.height !== null);
-  const hasReference = points.some((each) => each.reference !== null);
+  const hasReference = points.some((each) => each.reference !== null), hasTerrain = points.some((each) => each.terrain !== null);
   chart = Plot.plot({
     width: 520, height: 306, marginLeft: 52, marginBottom: 44, ariaLabel: "Height along the line",
     style: { fontSize: "12px", background: "transparent" },
@@ -95,6 +95,7 @@ function draw([x0, y0, x1, y1]) {
       // Missing heights leave a gap.
       Plot.areaY(points, { x: "distance", y1: (d) => low(d), y2: (d) => high(d), fill: colour("accent"), fillOpacity: 0.3 }),
       ...(hasReference ? [Plot.line(points, { x: "distance", y: (d) => d.reference ?? NaN, stroke: colour("warn"), strokeWidth: 1.4, strokeDasharray: "5 3" })] : []),
+      ...(hasTerrain ? [Plot.line(points, { x: "distance", y: (d) => d.terrain ?? NaN, stroke: colour("good"), strokeWidth: 1.6, strokeDasharray: "1 3" })] : []),
       Plot.line(points, { x: "distance", y: (d) => d.height ?? NaN, stroke: colour("accent"), strokeWidth: 1.6 }),
       Plot.ruleX(known, Plot.pointerX({ x: "distance", stroke: "currentColor", strokeOpacity: 0.4 })),
       Plot.tip(known, Plot.pointerX({ x: "distance", y: "height", fill: colour("raised"), stroke: colour("line"), title: words })),
@@ -108,10 +109,12 @@ function draw([x0, y0, x1, y1]) {
   $("along").value = 0;
   $("along-value").textContent = "";
   $("profile-figure").querySelector(".drawing").replaceChildren(chart);
-  const reference = hasReference ? ", and the reference dashed, in orange" : "";
-  $("profile-text").textContent =
-    `${last.length_m.toFixed(1)} m from ${map.words(x0, y0)} to ${map.words(x1, y1)}: ${known.length} of ${points.length} places, ` +
-    `${last.spacing_m.toFixed(2)} m apart, have a height. The band is one standard deviation to either side${reference}.`;
+  const others = [hasReference ? "The dashed brown line is the reference." : "", hasTerrain ? "The dotted green line is the DTM." : ""];
+  $("profile-text").textContent = [
+    `The line is ${last.length_m.toFixed(1)} m long, from ${map.words(x0, y0)} to ${map.words(x1, y1)}.`,
+    `Of ${points.length} places, ${last.spacing_m.toFixed(2)} m apart, ${known.length} have a height.`,
+    "The band is one standard deviation to either side.", ...others.filter(Boolean),
+  ].join(" ");
 }
 
 // The place on the map.
@@ -122,10 +125,11 @@ function mark(distance) {
 
 // One place of the line in words, for users without a pointer.
 function along(i) {
-  const [height, sigma, reference] = [last.height_m[i], last.sigma_m[i], last.reference_m?.[i] ?? null];
+  const [height, sigma] = [last.height_m[i], last.sigma_m[i]];
+  const [reference, terrain] = [last.reference_m?.[i] ?? null, last.terrain_m?.[i] ?? null];
   mark(last.distance_m[i]);
   const text = height === null ? `${last.distance_m[i].toFixed(1)} m along: no height` :
-    words({ distance: last.distance_m[i], height, sigma, reference }).replaceAll("\n", ", ");
+    words({ distance: last.distance_m[i], height, sigma, reference, terrain }).replaceAll("\n", ", ");
   $("along-value").textContent = text;
   $("along").setAttribute("aria-valuetext", text);
 }
@@ -138,9 +142,10 @@ function high({ height, sigma }) {
   return height === null ? NaN : height + (sigma ?? 0);
 }
 
-function words({ distance, height, sigma, reference }) {
+function words({ distance, height, sigma, reference, terrain }) {
   const lines = [`${distance.toFixed(1)} m along`, `height ${height.toFixed(2)} m`];
-  if (sigma !== null) lines.push(`σ ${sigma.toFixed(3)} m`);
+  if (sigma !== null) lines.push(`standard deviation ${sigma.toFixed(3)} m`);
   if (reference !== null) lines.push(`reference ${reference.toFixed(2)} m`);
+  if (terrain !== null) lines.push(`DTM ${terrain.toFixed(2)} m`);
   return lines.join("\n");
 }

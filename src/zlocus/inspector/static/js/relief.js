@@ -1,4 +1,5 @@
-// The 3-D view: the surface with a layer as its texture.
+// The 3-D view: the surface with a layer as its texture. It is broken at jumps, where the heights of neighbouring places
+// belong to two surfaces: each goes on level to the middle between the places, and a plain grey wall joins the two.
 
 import * as THREE from "three";
 import { ask } from "./api.js";
@@ -11,7 +12,10 @@ import { OrbitControls } from "../vendor/three/OrbitControls.js";
 const MAX_SIDE = 512, PICTURE_SIDE = 2048;
 // Factor of the distance for each key press.
 const CLOSER = 0.85;
-let surface, renderer, scene, camera, controls, mesh = null, span = 0, shows = 0, isPlaced = false;
+// Bits of a place: the surface is broken between it and the next place in its row, and in its column.
+const TO_RIGHT = 1, TO_BELOW = 2;
+const WALL_GREY = 0x9a9a9a;
+let surface, renderer, scene, camera, controls, mesh = null, walls = null, span = 0, shows = 0, isPlaced = false;
 
 export function make(about) {
   surface = about;
@@ -23,6 +27,10 @@ export function make(about) {
   $("exaggeration").addEventListener("input", () => {
     exaggerate();
     state.set({ exaggeration: $("exaggeration").value });
+  });
+  $("walls").addEventListener("change", () => {
+    if (walls) walls.visible = $("walls").checked;
+    draw();
   });
   $("export-relief").addEventListener("click", () => {
     draw();
@@ -84,8 +92,9 @@ export async function show() {
   const size = { height: Math.max(Math.min(Math.round(part.rows * scale), PICTURE_SIDE), 2), width: Math.max(Math.min(Math.round(part.cols * scale), PICTURE_SIDE), 2) };
   try {
     const [answer, texture] = await Promise.all([ask("heights", part), load(map.pictureAddress({ ...part, ...size }, names))]);
-    const heights = new Float32Array(await answer.arrayBuffer());
-    if (number === shows) build(part, heights, texture);
+    const content = await answer.arrayBuffer(), n = part.height * part.width;
+    const heights = new Float32Array(content, 0, n), breaks = new Uint8Array(content, 4 * n, n);
+    if (number === shows) build(part, heights, breaks, texture);
   } catch (error) {
     $("relief-text").textContent = error.message || "The surface could not be shown.";
   }
@@ -100,7 +109,7 @@ function load(address) {
 }
 
 // The longer side of the part has length 1, and heights have the same scale.
-function build(part, heights, texture) {
+function build(part, heights, breaks, texture) {
   const { height: rows, width: cols } = part;
   const known = heights.filter(Number.isFinite);
   if (!known.length) {
@@ -111,44 +120,95 @@ function build(part, heights, texture) {
   const middle = sorted[Math.floor(sorted.length / 2)];
   const step = (part.rows / rows) * surface.transform[0];
   span = Math.max(rows, cols) * step;
-  const places = new Float32Array(3 * rows * cols), uv = new Float32Array(2 * rows * cols);
-  for (let i = 0; i < rows * cols; i++) {
-    const row = Math.floor(i / cols), col = i % cols, z = heights[i];
-    places.set([((col + 0.5 - cols / 2) * step) / span, (Number.isFinite(z) ? z - middle : 0) / span, ((row + 0.5 - rows / 2) * step) / span], 3 * i);
-    uv.set([(col + 0.5) / cols, 1 - (row + 0.5) / rows], 2 * i);
-  }
+  const found = triangles(heights, breaks, rows, cols);
+  const scaled = (places) => {
+    const all = new Float32Array(places.length);
+    for (let i = 0; i < places.length; i += 3) {
+      all.set([((places[i] + 0.5 - cols / 2) * step) / span, (places[i + 1] - middle) / span, ((places[i + 2] + 0.5 - rows / 2) * step) / span], i);
+    }
+    return new THREE.BufferAttribute(all, 3);
+  };
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
-  geometry.setAttribute("uv", new THREE.BufferAttribute(uv, 2));
-  geometry.setIndex(new THREE.BufferAttribute(triangles(heights, rows, cols), 1));
+  geometry.setAttribute("position", scaled(found.places));
+  geometry.setAttribute("uv", new THREE.BufferAttribute(textured(found.places, rows, cols), 2));
+  geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(found.index), 1));
   geometry.computeVertexNormals();
-  const material = new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide });
-  if (mesh) {
-    scene.remove(mesh);
-    mesh.geometry.dispose();
-    mesh.material.map.dispose();
-    mesh.material.dispose();
-  }
-  mesh = new THREE.Mesh(geometry, material);
-  scene.add(mesh);
+  const upright = new THREE.BufferGeometry();
+  upright.setAttribute("position", scaled(found.walls));
+  upright.computeVertexNormals();
+  remove();
+  mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ map: texture, side: THREE.DoubleSide }));
+  walls = new THREE.Mesh(upright, new THREE.MeshLambertMaterial({ color: WALL_GREY, side: THREE.DoubleSide }));
+  walls.visible = $("walls").checked;
+  scene.add(mesh, walls);
   fit();
   place();
   exaggerate();
-  const shape = `${rows} x ${cols} places, ${step.toFixed(2)} m apart`;
-  $("relief-text").textContent = `${shape}, ${sorted[0].toFixed(1)} to ${sorted.at(-1).toFixed(1)} m. Drag to turn, use the wheel or pinch to zoom. Cells without a height are holes.`;
+  $("relief-text").textContent = `${rows} × ${cols} places, ${step.toFixed(2)} m apart, from ${sorted[0].toFixed(1)} to ` +
+    `${sorted.at(-1).toFixed(1)} m. Drag to turn. Use the wheel, or pinch, to zoom. Cells without a height are holes. Where the ` +
+    "height jumps, the surface is broken, and a grey wall stands: no height was measured on it.";
   $("relief-view").dataset.places = String(known.length);
+  $("relief-view").dataset.walls = String(found.walls.length / 9);
 }
 
-// Two triangles for each square of places that all have a height.
-function triangles(heights, rows, cols) {
-  const found = [];
+function remove() {
+  for (const old of [mesh, walls]) {
+    if (!old) continue;
+    scene.remove(old);
+    old.geometry.dispose();
+    old.material.map?.dispose();
+    old.material.dispose();
+  }
+}
+
+function textured(places, rows, cols) {
+  const uv = new Float32Array((2 * places.length) / 3);
+  for (let i = 0; i < places.length / 3; i++) uv.set([(places[3 * i] + 0.5) / cols, 1 - (places[3 * i + 2] + 0.5) / rows], 2 * i);
+  return uv;
+}
+
+// Corners (column, height, row) of the surface, its triangles, and the triangles of the walls. A square of four places
+// whose sides are not broken is two triangles; any other has a quarter for each place.
+function triangles(heights, breaks, rows, cols) {
+  const places = [], index = [], upright = [];
+  for (let i = 0; i < rows * cols; i++) places.push(i % cols, Number.isFinite(heights[i]) ? heights[i] : 0, Math.floor(i / cols));
   for (let row = 0; row + 1 < rows; row++) {
     for (let col = 0; col + 1 < cols; col++) {
       const a = row * cols + col, b = a + 1, c = a + cols, d = c + 1;
-      if ([a, b, c, d].every((i) => Number.isFinite(heights[i]))) found.push(a, c, b, b, c, d);
+      if (![a, b, c, d].every((i) => Number.isFinite(heights[i]))) continue;
+      // Whether the sides above, right, below and left are broken.
+      const sides = [breaks[a] & TO_RIGHT, breaks[b] & TO_BELOW, breaks[c] & TO_RIGHT, breaks[a] & TO_BELOW];
+      if (sides.some(Boolean)) quarters(row, col, [a, b, d, c].map((i) => heights[i]), sides, places, index, upright);
+      else index.push(a, c, b, b, c, d);
     }
   }
-  return new Uint32Array(found);
+  return { places, index, walls: upright };
+}
+
+// Quarters of a square with broken sides. z : heights of its places, clockwise from the upper left one; sides : broken
+// ones, clockwise from the upper one, the first between places 0 and 1.
+function quarters(row, col, z, sides, places, index, upright) {
+  const at = [[col, row], [col + 1, row], [col + 1, row + 1], [col, row + 1]], centre = [col + 0.5, row + 0.5];
+  const halfway = at.map(([x, y], k) => [(x + at[(k + 1) % 4][0]) / 2, (y + at[(k + 1) % 4][1]) / 2]);
+  // The height in the middle is the mean of the places that whole sides join.
+  const joined = z.map((_, k) => {
+    const group = [k];
+    for (let n = k; !sides[n % 4] && group.length < 4; n++) group.push((n + 1) % 4);
+    for (let n = k + 3; !sides[n % 4] && group.length < 4 && !group.includes(n % 4); n--) group.push(n % 4);
+    return group.reduce((sum, i) => sum + z[i], 0) / group.length;
+  });
+  const beside = (k, side) => (sides[side] ? z[k] : (z[side] + z[(side + 1) % 4]) / 2);
+  z.forEach((height, k) => {
+    const before = (k + 3) % 4, first = places.length / 3;
+    for (const [[x, y], value] of [[at[k], height], [halfway[k], beside(k, k)], [centre, joined[k]], [halfway[before], beside(k, before)]]) {
+      places.push(x, value, y);
+    }
+    index.push(first, first + 3, first + 2, first, first + 2, first + 1);
+    if (!sides[k]) return;
+    const other = (k + 1) % 4, [[x, y], [u, v]] = [halfway[k], centre];
+    const [one, two, three, four] = [[x, height, y], [u, joined[k], v], [u, joined[other], v], [x, z[other], y]];
+    upright.push(...one, ...two, ...three, ...one, ...three, ...four);
+  });
 }
 
 function place() {
@@ -178,7 +238,7 @@ function keepPlace() {
 function exaggerate() {
   $("exaggeration-value").textContent = $("exaggeration").value;
   if (!mesh) return;
-  mesh.scale.y = Number($("exaggeration").value);
+  mesh.scale.y = walls.scale.y = Number($("exaggeration").value);
   draw();
 }
 
