@@ -31,7 +31,7 @@ from zlocus.core.errors import ConfigError, InputError, OutputError
 from zlocus.core.options import RunConfig
 from zlocus.evaluation.comparison import Comparison
 from zlocus.evaluation.evaluate import evaluate
-from zlocus.inspector.cell import WhatIf, match_record
+from zlocus.inspector.cell import WhatIf, labels_say, match_record, nearest_says
 from zlocus.inspector.folder import Patch, read_patch, surface_folder
 from zlocus.inspector.guard import inline_hashes
 from zlocus.inspector.inspection import MADE_AGAIN, NOT_THE_SAME, Inspection
@@ -57,7 +57,8 @@ SHIFT_M = (2.0, -1.0, 0.5)
 @pytest.fixture(scope="module")
 def out(images, tmp_path_factory):
     """A run over all of the sine; not to be changed."""
-    return run(images("sine"), tmp_path_factory.mktemp("inspected") / "out", SMALL_TILES, report=True).out
+    out = tmp_path_factory.mktemp("inspected") / "out"
+    return run(images("sine"), out, SMALL_TILES, report=True, products=("hillshade", "dtm")).out
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +181,7 @@ def test_windows_and_lines_are_those_of_the_images(page, out, scene):
 def test_a_cell_without_a_height_has_curves_all_the_same(out, scene):
     folder = surface_folder(out)
     row, col = a_cell(out)
-    found = match_record(scene, folder.centre_of(row, col), np.nan, WhatIf())
+    found = match_record(folder, scene, folder.centre_of(row, col), np.nan, WhatIf())["match"]
     assert "tie points" in found["height_from"]
     assert len(found["heights_m"]) == 2 * scene.config.selection.reach_steps + 1
 
@@ -194,7 +195,7 @@ def test_two_images_are_needed(page, out):
     assert found["height_m"] is not None
 
 
-@pytest.mark.parametrize("layer", ["hillshade", "height", "ortho", "sigma", "views", "quality", "difference"])
+@pytest.mark.parametrize("layer", ["hillshade", "height", "ortho", "sigma", "views", "quality", "dtm", "above", "difference"])
 def test_layers_are_clear_where_the_surface_is_empty(page, out, layer):
     _, client = page
     answer = client.get(f"tiles/{layer}/0/0/0.png")
@@ -215,6 +216,10 @@ def test_layers_are_clear_where_the_surface_is_empty(page, out, layer):
     elif layer == "difference":
         known[60:70, 60:70] = False
         np.testing.assert_array_equal(shown, known)
+    elif layer in ("dtm", "above"):
+        with rasterio.open(out / "dtm.tif") as file:
+            is_ground = np.isfinite(file.read(1))
+        np.testing.assert_array_equal(shown, is_ground & known if layer == "above" else is_ground)
     else:
         np.testing.assert_array_equal(shown, known)
 
@@ -229,6 +234,80 @@ def test_heights_are_coloured_by_their_share_of_the_range(page, out):
     expected = cv2.applyColorMap(np.nan_to_num(255 * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     away = np.abs(drawn[: heights.shape[0], : heights.shape[1], :3].astype(int) - expected)[known]
     assert np.percentile(away, 99) <= 8  # ticks are rounded
+
+
+def test_heights_above_the_terrain_are_those_of_both_rasters(page, out):
+    inspection, client = page
+    row, col = a_cell(out)
+    with rasterio.open(out / "dtm.tif") as file:
+        ground = file.read(1)
+    heights = heights_of(out)
+    x, y = inspection.folder.centre_of(row, col)
+    found = client.get("api/cell", params={"x": x, "y": y}).json()
+    assert found["above_terrain_m"] == pytest.approx(heights[row, col] - ground[row, col], abs=ROUNDED_M)
+    line = client.get("api/profile", params={"x0": x, "y0": y, "x1": x + 10, "y1": y}).json()
+    expected = ground[row, col : col + len(line["terrain_m"])]
+    np.testing.assert_allclose(np.array(line["terrain_m"], float), expected, atol=ROUNDED_M)
+    drawn = cv2.imdecode(np.frombuffer(client.get("tiles/above/0/0/0.png").content, np.uint8), cv2.IMREAD_UNCHANGED)
+    top = float(inspection.layers["above"].legend["ticks"][-1])
+    share = np.clip((heights - ground) / top, 0, 1)[row, col]
+    expected = cv2.applyColorMap(np.array([[255 * share]], np.uint8), cv2.COLORMAP_INFERNO)[0, 0]
+    assert np.abs(drawn[row, col, :3].astype(int) - expected).max() <= 8  # ticks are rounded
+
+
+def test_without_a_terrain_model_there_are_no_layers_of_it(out, tmp_path):
+    copy = Path(shutil.copytree(out, tmp_path / "out"))
+    (copy / "dtm.tif").unlink()
+    inspection = Inspection(copy)
+    assert not {"dtm", "above"} & set(inspection.layers)
+    assert not inspection.summary()["has_terrain"]
+
+
+def test_the_extent_is_that_of_the_heights(page, out):
+    inspection, _ = page
+    rows, cols = np.nonzero(np.isfinite(heights_of(out)))
+    assert inspection.summary()["extent"] == [rows.min(), cols.min(), rows.max() + 1, cols.max() + 1]
+
+
+def test_tie_points_are_told_with_their_heights(page, out, scene):
+    inspection, client = page
+    row, col = a_cell(out)
+    x, y = inspection.folder.centre_of(row, col)
+    found = client.get("api/cell", params={"x": x, "y": y}).json()["match"]["neighbours"]
+    heights = heights_of(out)
+    for point in found["points"]:
+        (tie,) = np.flatnonzero(np.hypot(*(scene.run.match_scene.ties[:, :2] - (point["x"], point["y"])).T) < 1e-6)[:1]
+        assert point["height_m"] == pytest.approx(scene.run.match_scene.ties[tie, 2])
+        at = inspection.folder.cell_of(point["x"], point["y"])
+        if at is None or np.isnan(heights[at]):
+            assert point["above_surface_m"] is None
+        else:
+            assert point["above_surface_m"] == pytest.approx(point["height_m"] - heights[at], abs=ROUNDED_M)
+        assert f"lies {point['distance_m']:.1f} m from the cell" in point["says"]
+    first = found["points"][0]
+    assert found["says"] == (
+        f"The nearest tie point lies {first['distance_m']:.1f} m away; its height differs by "
+        f"{abs(first['above_surface_m']):.2f} m from the surface there."
+    )
+
+
+def test_labels_of_a_tie_point_in_words():
+    assert labels_say("a", ["b", "c", "d"], [1, -1, 1]) == "There the match of a is good with b, d; poor with c."
+    assert nearest_says(6.4, -0.02).endswith("differs by 0.02 m from the surface there.")
+    assert "no height there" in nearest_says(6.4, np.nan)
+
+
+def test_what_the_matcher_weighed_is_asked_for_by_itself(page, out):
+    inspection, client = page
+    x, y = inspection.folder.centre_of(*a_cell(out))
+    found = client.get("api/matcher", params={"x": x, "y": y}).json()
+    assert found["says"][0].endswith("The cell gets the height of the surface again.")
+    part = inspection._matched_part
+    beside = client.get("api/matcher", params={"x": x + inspection.folder.cell_m, "y": y}).json()
+    assert inspection._matched_part is part  # it is not matched a second time
+    assert beside["says"][0] == found["says"][0]
+    assert client.get("api/matcher", params={"x": 0, "y": 0}).status_code == 404
+    assert client.get("api/matcher", params={"x": x, "y": y, "window": 7}).status_code == 400
 
 
 def test_hillshade_is_made_where_the_run_made_none(out, tmp_path):
@@ -284,7 +363,9 @@ def test_long_profiles_and_those_beyond_the_surface(page):
 def test_heights_for_the_view_in_three_dimensions(page, out):
     _, client = page
     asked = {"row": 10, "col": 20, "rows": 30, "cols": 40, "height": 30, "width": 40}
-    found = np.frombuffer(client.get("api/heights", params=asked).content, "<f4").reshape(30, 40)
+    content = client.get("api/heights", params=asked).content
+    assert len(content) == 5 * 30 * 40  # heights, and a byte of breaks for each
+    found = np.frombuffer(content, "<f4", 30 * 40).reshape(30, 40)
     np.testing.assert_array_equal(found, heights_of(out)[10:40, 20:60])
 
 

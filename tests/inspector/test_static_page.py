@@ -16,12 +16,13 @@ from browser import found_browser
 from inspected import a_cell, served
 from rendered_scenes import SMALL_TILES, run
 from zlocus.evaluation.comparison import Comparison
+from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.restored_run import restored
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
 from zlocus.products.point_report import PointReport
 
-LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "difference"]
+LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "dtm", "above", "difference"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
 WAIT_MS = 30_000
 # What the page rounds: correlations to 4 digits, ratios to 3, heights to 2.
@@ -30,12 +31,15 @@ REFERENCE_M = 0.25
 LEAST_TARGET_PX = 36
 # Height of a legend of colours that run, below a saved map.
 LEGEND_PX = 62
+# Beside the surface, where the map shows all of it.
+MARGIN_PX = 10
 
 
 @pytest.fixture(scope="module")
 def out(images, tmp_path_factory):
     """A run over all of the sine; not to be changed."""
-    return run(images("sine"), tmp_path_factory.mktemp("page") / "out", SMALL_TILES, report=True).out
+    out = tmp_path_factory.mktemp("page") / "out"
+    return run(images("sine"), out, SMALL_TILES, report=True, products=("hillshade", "dtm")).out
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +166,76 @@ def agrees(table, report: PointReport) -> None:
         assert number(row["peak"]) == pytest.approx(report.heights_m[single.peaks.peak[j]], abs=SHOWN_M)
 
 
+@pytest.mark.parametrize("size", [DESK, PHONE])
+def test_the_map_fills_the_window_at_the_start_and_when_it_changes(browser, inspected, size):
+    page, faults = page_at(browser, inspected[1], size)
+    assert page.locator("#panel").is_hidden()
+    fills(page, inspected[0])
+    # A smaller window, of another shape.
+    page.set_viewport_size({"width": size["width"], "height": size["height"] - 250})
+    page.wait_for_timeout(300)
+    fills(page, inspected[0])
+    assert "at=" not in link_of(page)
+    # Another place stays where it is.
+    page.locator("#map").focus()
+    page.keyboard.press("+")
+    page.wait_for_timeout(500)
+    at = re.search("at=[^&]*", link_of(page))[0]
+    page.set_viewport_size(size)
+    page.wait_for_timeout(300)
+    assert re.search("at=[^&]*", link_of(page))[0] == at
+    page.context.close()
+    assert faults == []
+
+
+def fills(page, inspection) -> None:
+    """The map takes all below the header, and the surface fills it up to the legend and the list in one direction."""
+    window = page.evaluate("[innerWidth, innerHeight]")
+    box = page.locator("#map").bounding_box()
+    assert box["width"] == window[0]
+    assert box["y"] + box["height"] == pytest.approx(window[1], abs=1)
+    assert page.evaluate("document.documentElement.scrollHeight") <= window[1] + 1
+    legend = page.locator("#legends").bounding_box()
+    assert page.locator("#legends .legend:visible").count() == 1
+    top, left, bottom, right = inspection.summary()["extent"]
+    scale = page.evaluate(
+        """async () => (await import(new URL("static/js/map.js", document.baseURI))).patch(1000)"""
+    )
+    px = box["width"] / scale["cols"]
+    width, height = px * (right - left), px * (bottom - top)
+    is_phone = box["width"] < 500
+    room = (
+        box["width"] - (0 if is_phone else box["width"] - page.locator("#layers").bounding_box()["x"]) - 2 * MARGIN_PX,
+        (legend["y"] if is_phone else box["y"] + box["height"]) - box["y"] - 2 * MARGIN_PX,
+    )
+    assert max(width / room[0], height / room[1]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_page_tells_of_images_and_costs_what_the_library_tells(page, inspected, out):
+    folder, (row, col) = inspected[0].folder, a_cell(out)
+    click_cell(page, folder, row, col)
+    record = inspected[0].cell(*folder.centre_of(row, col), WhatIf())
+    assert page.locator("#accounts-say").inner_text() == record["accounts_say"]
+    assert page.locator("#accounts li").all_inner_texts() == [account["says"] for account in record["accounts"]]
+    assert page.locator("#ties-say").inner_text() == record["match"]["neighbours"]["says"]
+    page.locator("#matcher summary").click()
+    page.wait_for_selector("#costs-figure svg")
+    weighed = inspected[0].matcher(*folder.centre_of(row, col))
+    assert page.locator("#matcher-says li").all_inner_texts() == weighed["says"]
+    assert "weighed=1" in link_of(page)
+    page.locator("#close").click()
+    assert page.locator("#panel").is_hidden()
+    assert page.locator("#map").bounding_box()["width"] == DESK["width"]
+
+
+def test_a_saved_figure_tells_what_became_of_the_images(page, inspected, out, tmp_path):
+    click_cell(page, inspected[0].folder, *a_cell(out))
+    button = page.locator("#windows-figure").get_by_role("button", name="SVG")
+    text = re.sub(r"<[^>]*>", " ", saved(page, button, tmp_path).decode())
+    said = page.locator("#accounts li").first.inner_text()
+    assert " ".join(said.split()) in " ".join(text.split())
+
+
 def test_every_layer_can_be_switched_and_made_fainter(page):
     for name in LAYERS:
         box, shown = page.locator(f"#layer-{name}"), page.locator(f".leaflet-layer.layer-{name}")
@@ -262,7 +336,7 @@ def test_a_profile_is_drawn_between_two_clicks(page, inspected):
     said = page.locator("#profile-text").inner_text()
     ends = [float(part) for part in re.search(r"line=([^&]*)", link_of(page))[1].split("%2C")]
     assert number(said) == pytest.approx(np.hypot(ends[2] - ends[0], ends[3] - ends[1]), abs=0.051)
-    assert "one standard deviation to either side, and the reference dashed, in orange" in said
+    assert "one standard deviation to either side. The dashed brown line is the reference. The dotted green" in said
     assert page.locator("#profile-figure svg path").count() >= 3  # band, reference, surface
 
 

@@ -140,7 +140,8 @@ def test_the_inspector_names_the_image_whose_mask_covers_a_cell(triplet):
         found = []
         for cells in (excluded, ~excluded & ((quality & Quality.UNSEEN) == 0)):
             row, col = np.argwhere(cells)[cells.sum() // 2]
-            found.append(inspection.cell(*(source.transform * (col + 0.5, row + 0.5)), WhatIf())["masked_by"])
+            accounts = inspection.cell(*(source.transform * (col + 0.5, row + 0.5)), WhatIf())["accounts"]
+            found.append([account["image"] for account in accounts if account["kind"] == "masked"])
     assert found == [["nadir"], []]
 
 

@@ -29,7 +29,7 @@ export function make(about) {
   crs = L.extend({}, L.CRS.Simple, { transformation: new L.Transformation(1 / a, -c / a, 1 / e, -f / e) });
   map = L.map("map", {
     crs, minZoom: -about.levels - 1, maxZoom: CLOSEST, zoomSnap: 0, zoomDelta: 1, attributionControl: false,
-    wheelPxPerZoomLevel: 90, keyboardPanDelta: 120,
+    wheelPxPerZoomLevel: 90, keyboardPanDelta: 120, trackResize: false,
   });
   L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
   about.layers.forEach(addLayer);
