@@ -21,14 +21,13 @@ ZLOCUS = Path(sys.executable).with_name("zlocus")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SIZE = {"width": 1360, "height": 1000}
 WAIT_MS = 120_000
-# A cell by a house, which some images do not see; all of the middle from the south.
+# All of the surface at the start; a cell by a house, which three images do not see; all of the middle from the south.
 VIEWS = {
-    "inspect_cell.png": "at=462049,5246924,1&cell=462055.5,5246913.9&layers=hillshade:1,height:0.55&tab=cell",
+    "inspect_map.png": "layers=hillshade:1,above:0.6",
+    "inspect_cell.png": "at=462051,5246930,1.9&cell=462049,5246930&layers=hillshade:1,height:0.55&tab=cell&weighed=1",
     "inspect_relief.png": "at=462049,5246940,0.75&layers=hillshade:1,ortho:0.5,sigma:0.5&tab=relief"
     "&eye=-0.35,0.75,0.95,0,-0.02,0.03",
 }
-# How far the panel of the cell is scrolled, px.
-SCROLLED = 390
 
 
 def main() -> None:
@@ -39,7 +38,8 @@ def main() -> None:
         sys.exit(f"There is no browser: set CHROMIUM, or install one of {', '.join(BROWSERS)}.")
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "demo"
-        subprocess.run([ZLOCUS, "demo", "-o", out], check=True, stdout=subprocess.DEVNULL)
+        for command in (["demo", "-o", out], ["products", out, "--products", "dtm"]):
+            subprocess.run([ZLOCUS, *command], check=True, stdout=subprocess.DEVNULL)
         words = [ZLOCUS, "inspect", out, "--reference", out / "scene" / "truth_dsm.tif"]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
@@ -69,10 +69,9 @@ def prepare(page: Any, view: str) -> None:
     """Wait until a view is drawn, and scroll to the part that the picture shows."""
     if "tab=relief" in view:
         page.wait_for_selector("#relief-view[data-places]")
-    else:
+    elif "tab=cell" in view:
         page.wait_for_selector('#match:not([hidden])[aria-busy="false"]')
-        page.locator("#height").fill("52")
-        page.evaluate(f"document.getElementById('cell').scrollTop = {SCROLLED}")
+        page.wait_for_selector("#costs-figure svg")
     page.wait_for_timeout(1500)
 
 

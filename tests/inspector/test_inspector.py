@@ -36,6 +36,7 @@ from zlocus.inspector.folder import Patch, read_patch, surface_folder
 from zlocus.inspector.guard import inline_hashes
 from zlocus.inspector.inspection import MADE_AGAIN, NOT_THE_SAME, Inspection
 from zlocus.inspector.queries import BadQuery, number, once, what_if, whole
+from zlocus.inspector.reference import name_of
 from zlocus.inspector.restored_run import restored
 from zlocus.inspector.server import page_files
 from zlocus.inspector.serving import checked_address, fragment_of, listening
@@ -46,6 +47,7 @@ from zlocus.products.point_report import PointReport, point_record
 from zlocus.products.report.maps import FLAG_GROUPS, groups_of
 from zlocus.products.tie_observations import OBSERVATIONS
 
+LAYERS = ["hillshade", "height", "ortho", "sigma", "views", "quality", "dtm", "above", "difference"]
 # Of what is rounded for the page: correlations, heights.
 ROUNDED_NCC, ROUNDED_M = 1e-5, 1e-4
 UNDULATION_M = 47.0
@@ -195,7 +197,7 @@ def test_two_images_are_needed(page, out):
     assert found["height_m"] is not None
 
 
-@pytest.mark.parametrize("layer", ["hillshade", "height", "ortho", "sigma", "views", "quality", "dtm", "above", "difference"])
+@pytest.mark.parametrize("layer", LAYERS)
 def test_layers_are_clear_where_the_surface_is_empty(page, out, layer):
     _, client = page
     answer = client.get(f"tiles/{layer}/0/0/0.png")
@@ -381,6 +383,11 @@ def test_a_picture_is_the_layers_over_each_other(page):
     expected = 0.75 * below[..., :3] + 0.25 * above[..., :3]
     assert both.sum() > 2000
     np.testing.assert_allclose(drawn[both][:, :3], expected[both], atol=1)
+
+
+def test_the_surface_of_another_run_has_the_name_of_its_folder(tmp_path):
+    assert name_of(tmp_path / "winter" / "dsm.tif") == "winter/dsm.tif"
+    assert name_of(tmp_path / "winter" / "laser.tif") == "laser.tif"
 
 
 def test_the_reference_is_moved_as_the_surface_is(out, tmp_path):

@@ -198,9 +198,7 @@ def fills(page, inspection) -> None:
     legend = page.locator("#legends").bounding_box()
     assert page.locator("#legends .legend:visible").count() == 1
     top, left, bottom, right = inspection.summary()["extent"]
-    scale = page.evaluate(
-        """async () => (await import(new URL("static/js/map.js", document.baseURI))).patch(1000)"""
-    )
+    scale = page.evaluate("""async () => (await import(new URL("static/js/map.js", document.baseURI))).patch(1000)""")
     px = box["width"] / scale["cols"]
     width, height = px * (right - left), px * (bottom - top)
     is_phone = box["width"] < 500

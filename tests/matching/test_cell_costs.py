@@ -51,15 +51,15 @@ def test_it_is_matched_as_a_tile_of_a_run_is(matched):
 def test_the_evidence_of_the_pairs_adds_up_to_the_cost(matched):
     """The mean of the best share of the pairs (Rockafellar, Uryasev 2000) is what the kernel made the cost of."""
     found, core, _ = matched
-    table, compared = found.evidence.table, 0
+    table, compared = found.table_and_counts.table, 0
     for row, col in cells_of(core):
         cell = cell_costs(found, row, col)
-        weights = np.array([pair.weight for pair in cell.pairs])
+        weights = np.array([pair.weight for pair in cell.pair_evidence])
         n_effective = weights.sum() ** 2 / (weights**2).sum()
         scale = table.unit * n_effective**table.pair_exponent
         highest = min(scale * table.highest, table.max_cost)
         for k in range(len(cell.heights_m)):
-            ratios = np.array([pair.log_ratio[k] for pair in cell.pairs])
+            ratios = np.array([pair.log_ratio[k] for pair in cell.pair_evidence])
             own = int(cell.cost[k]) - int(cell.known_cost[k])
             if np.isnan(ratios).any() or cell.cost[k] in (0, 255):
                 continue  # a pair does not see it, or the cost was cut off
@@ -73,16 +73,16 @@ def test_the_evidence_of_the_pairs_adds_up_to_the_cost(matched):
 def test_right_heights_have_evidence_and_no_prior_cost(matched):
     found, core, surface = matched
     chosen = [cell_costs(found, row, col) for row, col in cells_of(core)]
-    at_height = [np.nansum([pair.log_ratio[cell.chosen] for pair in cell.pairs]) for cell in chosen]
-    elsewhere = [np.nanmean([pair.log_ratio for pair in cell.pairs]) for cell in chosen]
+    at_height = [np.nansum([pair.log_ratio[cell.chosen] for pair in cell.pair_evidence]) for cell in chosen]
+    elsewhere = [np.nanmean([pair.log_ratio for pair in cell.pair_evidence]) for cell in chosen]
     assert np.mean(at_height) > 3 * np.mean(elsewhere)
     assert [int(cell.known_cost[cell.chosen]) for cell in chosen] == [0] * len(chosen)
     for cell, (row, col) in zip(chosen, cells_of(core), strict=True):
         assert cell.heights_m[cell.chosen] == pytest.approx(surface.height[row - core.row, col - core.col], abs=1.0)
         assert abs(cell.coarser_m - cell.heights_m[cell.chosen]).min() < 2.0
         assert cell.sees.sum() >= 2
-        n_counting = sum(bool(pair.counts[cell.chosen]) for pair in cell.pairs)
-        assert 1 <= n_counting <= len(cell.pairs)
+        n_counting = sum(bool(pair.counts[cell.chosen]) for pair in cell.pair_evidence)
+        assert 1 <= n_counting <= len(cell.pair_evidence)
 
 
 def test_cells_beyond_the_window_are_not_told(matched):

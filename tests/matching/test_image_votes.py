@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zlocus.matching.image_votes import MIN_GAIN, Vote, image_votes
+from zlocus.matching.image_votes import MIN_GAIN, Vote, votes_of_images
 
 N_HEIGHTS, N_CELLS, HERE, ELSEWHERE = 15, 49, 6, 11
 ALL = np.ones(5, bool)
@@ -40,11 +40,11 @@ def mean(values):
 
 
 def test_images_that_are_alike_agree(windows):
-    assert [vote.vote for vote in image_votes(windows, ALL, HERE)] == [Vote.AGREES] * 5
+    assert [vote.vote for vote in votes_of_images(windows, ALL, HERE)] == [Vote.AGREES] * 5
 
 
 def test_a_falsified_image_is_out_voted_by_the_others(windows):
-    votes = image_votes(falsified(windows), ALL, HERE)
+    votes = votes_of_images(falsified(windows), ALL, HERE)
     assert [vote.vote for vote in votes] == [Vote.AGREES] * 3 + [Vote.OUT_VOTED, Vote.AGREES]
     vote = votes[3]
     assert vote.peak == ELSEWHERE
@@ -55,7 +55,7 @@ def test_a_falsified_image_is_out_voted_by_the_others(windows):
 def test_the_numbers_are_those_of_plain_loops(windows):
     windows = falsified(windows)
     windows[1, :4] = np.nan  # it does not show those heights
-    votes = image_votes(windows, ALL, HERE)
+    votes = votes_of_images(windows, ALL, HERE)
     for i, vote in enumerate(votes):
         others = [j for j in range(5) if j != i]
         own = [mean([windows[i, h] @ windows[j, h] for j in others]) for h in range(N_HEIGHTS)]
@@ -71,26 +71,26 @@ def test_the_numbers_are_those_of_plain_loops(windows):
 
 def test_where_all_match_better_elsewhere_none_is_out_voted(windows):
     elsewhere = np.roll(windows, ELSEWHERE - HERE, axis=1)
-    assert {vote.vote for vote in image_votes(elsewhere, ALL, HERE)} == {Vote.OVERRULED}
+    assert {vote.vote for vote in votes_of_images(elsewhere, ALL, HERE)} == {Vote.OVERRULED}
 
 
 def test_of_two_images_none_out_votes_the_other(windows):
-    votes = image_votes(falsified(windows)[2:4], np.ones(2, bool), HERE)
+    votes = votes_of_images(falsified(windows)[2:4], np.ones(2, bool), HERE)
     assert [vote.vote for vote in votes] == [Vote.OVERRULED] * 2
     assert np.isnan(votes[0].others)
 
 
 def test_plain_ground_says_nothing_of_a_height(windows):
     flat = unit(windows[:, HERE][:, None] + 2.0 * np.random.default_rng(1).normal(size=(5, N_HEIGHTS, N_CELLS)))
-    votes = [vote for vote in image_votes(flat, ALL, HERE) if vote.at_peak - vote.correlation < MIN_GAIN]
+    votes = [vote for vote in votes_of_images(flat, ALL, HERE) if vote.at_peak - vote.correlation < MIN_GAIN]
     assert votes
     assert {vote.vote for vote in votes} <= {Vote.UNDECIDED, Vote.AGREES}
 
 
 def test_occluded_images_and_those_without_a_window_do_not_vote(windows):
     windows[0, HERE] = np.nan
-    votes = image_votes(windows, np.array([True, False, True, True, True]), HERE)
+    votes = votes_of_images(windows, np.array([True, False, True, True, True]), HERE)
     assert votes[:2] == [None, None]
     assert [vote.n_others for vote in votes[2:]] == [2, 2, 2]
-    alone = image_votes(windows, np.array([False, False, True, False, False]), HERE)
+    alone = votes_of_images(windows, np.array([False, False, True, False, False]), HERE)
     assert alone == [None] * 5

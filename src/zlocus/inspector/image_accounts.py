@@ -17,7 +17,7 @@ from zlocus.core.sensor_model import FloatArray
 from zlocus.inspector.folder import SurfaceFolder
 from zlocus.inspector.profile import cells_of, values_at
 from zlocus.io.open_raster import cached_raster
-from zlocus.matching.image_votes import ImageVote, Vote, image_votes
+from zlocus.matching.image_votes import ImageVote, Vote, votes_of_images
 from zlocus.matching.masked_cells import images_hidden_at
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.occluders import Occluder, occluder_of
@@ -152,7 +152,7 @@ def _votes(cell: LookedAtCell, occluders: dict[str, Occluder]) -> dict[str, Imag
     sees = np.array([name not in occluders for name in names])
     takes_part: NDArray[np.bool_] = sees if sees.sum() >= PAIR else np.ones(len(names), np.bool_)
     windows = place_curves.patches(large_window_side(cell.config.cost))
-    votes = image_votes(windows, takes_part, len(place_curves.heights_m) // 2)
+    votes = votes_of_images(windows, takes_part, len(place_curves.heights_m) // 2)
     return dict(zip(names, votes, strict=True))
 
 
@@ -188,12 +188,12 @@ def _compass(east: float, north: float) -> str:
     return COMPASS[round(math.degrees(math.atan2(east, north)) / 45) % 8]
 
 
-def _account_of_vote(cell: LookedAtCell, view: View, votes: dict[str, ImageVote | None]) -> dict[str, Any]:
+def _account_of_vote(cell: LookedAtCell, view: View, image_votes: dict[str, ImageVote | None]) -> dict[str, Any]:
     """The account of an image that shows a cell and sees it."""
     name, place_curves = view.name, cell.place_curves
     if place_curves is None:
         return _record(view, "not compared", f"{name} shows the cell, but no other image does.")
-    if name not in votes:
+    if name not in image_votes:
         limit = cell.config.selection.max_candidates
         n_showing = len(cell.match_scene.views_near(cell.place.xyz[None, :2]))
         if n_showing > limit + 1:
@@ -201,27 +201,30 @@ def _account_of_vote(cell: LookedAtCell, view: View, votes: dict[str, ImageVote 
         else:
             why = "It has no grey values in the whole window around it."
         return _record(view, "not compared", f"{name} shows the cell, but is not compared. {why}")
-    vote = votes[name]
-    if vote is None:
+    image_vote = image_votes[name]
+    if image_vote is None:
         return _record(view, "not compared", f"{name} shows the cell, but no other image sees it.")
-    peak = cell.metres(float(place_curves.heights_m[vote.peak]))
-    here = f"{vote.correlation:.2f}"
-    says = f"Its mean correlation with the other images is {here} here"
+    peak = cell.metres(float(place_curves.heights_m[image_vote.peak]))
+    own = f"Its mean correlation with the other images is {image_vote.correlation:.2f} here"
+    most = f"{image_vote.at_peak:.2f}"
+    others = (
+        f"The other {image_vote.n_others} images agree here with {image_vote.others:.2f}, and there with "
+        f"{image_vote.others_at_peak:.2f}."
+    )
     says = {
-        Vote.AGREES: f"{name} agrees. {says}.",
-        Vote.UNDECIDED: f"{name} cannot tell the height. {says}, and {vote.at_peak:.2f} at most, at {peak}.",
-        Vote.OUT_VOTED: f"{name} is out-voted. {says}. It would match best at {peak}, with {vote.at_peak:.2f}. The "
-        f"other {vote.n_others} images agree here with {vote.others:.2f}, and there with {vote.others_at_peak:.2f}.",
-        Vote.OVERRULED: f"{name} is overruled. {says}, and {vote.at_peak:.2f} at {peak}. {_overruled_by(vote)}",
-    }[vote.vote]
-    return _record(view, vote.vote.value, says)
+        Vote.AGREES: f"{name} agrees. {own}.",
+        Vote.UNDECIDED: f"{name} cannot tell the height. {own}, and {most} at most, at {peak}.",
+        Vote.OUT_VOTED: f"{name} is out-voted. {own}. It would match best at {peak}, with {most}. {others}",
+        Vote.OVERRULED: f"{name} is overruled. {own}, and {most} at {peak}. {_overruled_by(image_vote)}",
+    }[image_vote.vote]
+    return _record(view, image_vote.vote.value, says)
 
 
-def _overruled_by(vote: ImageVote) -> str:
+def _overruled_by(image_vote: ImageVote) -> str:
     """What puts the surface at another height than that at which an image matches best."""
-    if math.isnan(vote.others):
+    if math.isnan(image_vote.others):
         return "Two images cannot out-vote each other. The neighbouring cells decided."
     return (
-        f"The other {vote.n_others} images do not agree better here ({vote.others:.2f}) than there "
-        f"({vote.others_at_peak:.2f}). The neighbouring cells decided."
+        f"The other {image_vote.n_others} images do not agree better here ({image_vote.others:.2f}) than there "
+        f"({image_vote.others_at_peak:.2f}). The neighbouring cells decided."
     )

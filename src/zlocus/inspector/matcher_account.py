@@ -106,9 +106,9 @@ class WeighedCell:
         digits = max(2, math.ceil(1 - math.log10(self.match_scene.height_step) - 1e-9))
         return f"{height_m - self.undulation_m:.{digits}f} m"
 
-    def names(self, pair: PairEvidence) -> str:
+    def names(self, pair_evidence: PairEvidence) -> str:
         """The names of the images of a pair."""
-        return " and ".join(self.match_scene.views[number].name for number in pair.views)
+        return " and ".join(self.match_scene.views[number].name for number in pair_evidence.views)
 
     @property
     def chosen_m(self) -> float:
@@ -183,19 +183,19 @@ def coarser_level(cell: WeighedCell) -> list[str]:
 def evidence(cell: WeighedCell) -> str:
     """How many pairs of images speak for and against the chosen height."""
     costs = cell.costs
-    if not costs.pairs:
+    if not costs.pair_evidence:
         return (
             "The costs are those of correlation. Evidence is learned with mvll-sgm, in tiles of 80 000 cells or more, "
             "where enough cells have heights to learn from."
         )
-    seen = [pair for pair in costs.pairs if math.isfinite(pair.log_ratio[costs.chosen])]
+    seen = [pair for pair in costs.pair_evidence if math.isfinite(pair.log_ratio[costs.chosen])]
     if not seen:
         return "No pair of images sees the cell at the chosen height, so there is no evidence for it."
     ratio = np.array([pair.log_ratio[costs.chosen] for pair in seen])
     n_for, n_against = int((ratio > SILENT).sum()), int((ratio < -SILENT).sum())
     n_counting = sum(bool(pair.counts[costs.chosen]) for pair in seen)
     strongest = seen[int(np.abs(ratio).argmax())]
-    of_all = f"Of {len(costs.pairs)} pairs of images {len(seen)} see the cell at the chosen height."
+    of_all = f"Of {len(costs.pair_evidence)} pairs of images {len(seen)} see the cell at the chosen height."
     n_silent = len(seen) - n_for - n_against
     votes = f"{n_for or 'None'} {_verb(n_for)} for this height and {n_against or 'none'} against it."
     votes += f" {n_silent} {'says' if n_silent == 1 else 'say'} nothing." if n_silent else ""
@@ -244,7 +244,7 @@ def constraint(cell: WeighedCell) -> list[str]:
 def pair_records(cell: WeighedCell) -> list[dict[str, Any]]:
     """Evidence of each pair of images at the chosen height, and where it is largest; the strongest first."""
     costs, records = cell.costs, []
-    for pair in costs.pairs:
+    for pair in costs.pair_evidence:
         here = float(pair.log_ratio[costs.chosen])
         record: dict[str, Any] = {
             "images": [cell.match_scene.views[number].name for number in pair.views], "evidence": here,
@@ -258,11 +258,11 @@ def pair_records(cell: WeighedCell) -> list[dict[str, Any]]:
     return sorted(records, key=lambda each: -abs(each["evidence"]) if math.isfinite(each["evidence"]) else 1.0)
 
 
-def _pair_says(cell: WeighedCell, pair: PairEvidence, here: float) -> str:
+def _pair_says(cell: WeighedCell, pair_evidence: PairEvidence, here: float) -> str:
     """The evidence of a pair in a sentence."""
     if not math.isfinite(here):
         return "does not see the cell at this height"
     if abs(here) <= SILENT:
         return "says nothing"
     text = _odds(here)
-    return text if pair.counts[cell.costs.chosen] else f"{text}, but the pair is not among those that count"
+    return text if pair_evidence.counts[cell.costs.chosen] else f"{text}, but the pair is not among those that count"

@@ -19,6 +19,9 @@ from zlocus.io.vertical import named_vertical_datum
 from zlocus.products.report.comparison import saturated_error_m
 from zlocus.products.report.text import against_reference
 
+# Every run calls its surface so.
+DSM = "dsm.tif"
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -56,13 +59,18 @@ def reference_for(dsm: Path, comparison: Comparison, scratch: Path) -> Reference
     InputError, ConfigError
         See `evaluate`.
     """
-    evaluation, name = evaluate(dsm, comparison), comparison.reference.name
+    evaluation, name = evaluate(dsm, comparison), name_of(comparison.reference)
     heights = comparable(dsm, comparison, evaluation.shift)
     crs = None if heights.horizontal is None else heights.horizontal.to_wkt()
     path, geobox = scratch / "reference.tif", GeoBox(heights.z.shape, heights.transform, crs)
     with RasterSink(path, geobox, RasterBands("float32", float("nan"), units="m")) as sink:
         sink.write(0, 0, heights.z.astype(np.float32))
     return Reference(path, name, saturated_error_m(evaluation), against_reference(evaluation, name))
+
+
+def name_of(reference: Path) -> str:
+    """Name of a reference; with that of its folder where it is the surface of another run."""
+    return f"{reference.resolve().parent.name}/{DSM}" if reference.name == DSM else reference.name
 
 
 def comparable(dsm: Path, comparison: Comparison, shift: Shift | None) -> HeightRaster:

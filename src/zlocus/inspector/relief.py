@@ -18,7 +18,7 @@ TO_RIGHT, TO_BELOW = np.uint8(1), np.uint8(2)
 
 
 @dataclass(frozen=True)
-class Relief:
+class BrokenRelief:
     """Heights (r, c) float32 m, NaN where there is none, and breaks (r, c) uint8, see `TO_RIGHT` and `TO_BELOW`."""
 
     heights: NDArray[np.float32]
@@ -30,11 +30,11 @@ class Relief:
         return self.heights.astype("<f4").tobytes() + self.breaks.tobytes()
 
 
-def relief_of(folder: SurfaceFolder, patch: Patch) -> Relief:
+def relief_of(folder: SurfaceFolder, patch: Patch) -> BrokenRelief:
     """Heights and breaks of a patch of a surface."""
     heights = read_patch(folder.path("dsm"), patch, average=True).values[0].astype(np.float32)
     spacing_m = folder.cell_m * patch.cols / patch.width, folder.cell_m * patch.rows / patch.height
-    return Relief(heights, breaks_of(heights, spacing_m, jump_m(folder)))
+    return BrokenRelief(heights, breaks_of(heights, spacing_m, jump_m(folder)))
 
 
 def jump_m(folder: SurfaceFolder) -> float:
@@ -44,7 +44,7 @@ def jump_m(folder: SurfaceFolder) -> float:
 
 
 def breaks_of(heights: NDArray[np.float32], spacing_m: tuple[float, float], jump_m: float) -> NDArray[np.uint8]:
-    """Where a surface is broken, (r, c) uint8, see `Relief`.
+    """Where a surface is broken, (r, c) uint8, see `BrokenRelief`.
 
     heights : (r, c) m; spacing_m : between places along a row and along a column; jump_m : see `jump_m`.
     """

@@ -157,7 +157,7 @@ def line(inspection: Inspection, request: Request) -> Response:
 
 
 def heights(inspection: Inspection, request: Request) -> Response:
-    """Heights of a patch and where its surface is broken, see `Relief.content`."""
+    """Heights of a patch and where its surface is broken, see `BrokenRelief.content`."""
     values, _ = queries.once(request.query_params.multi_items(), queries.PATCH)
     relief = relief_of(inspection.folder, queries.patch(values))
     return Response(relief.content, media_type="application/octet-stream")

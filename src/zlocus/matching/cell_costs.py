@@ -39,20 +39,20 @@ UNIT_OF_PAIR = np.float32(250.0 / (2 * MAX_LOG_RATIO))
 class MatchedCosts:
     """A tile that was matched again, with the costs of its finest level.
 
-    tile : its inputs; level : the finest level, its window with halo; coarser : result of the next coarser level;
+    tile : its inputs; level : the finest level, its window with halo; coarser_result : that of the next coarser level;
     result : of the finest level, before planes and refinement; costs : of its last pass, before the semi-global
     constraint; known_costs : (v,) uint8, those of the coarser level's candidates, which are a part of the costs, None
-    without; evidence : the table of the pass, None where costs are those of correlation; height_m : (r, c) float32,
-    ellipsoidal, of the surface; NaN where it has none.
+    without; table_and_counts : the evidence of the pass, None where costs are those of correlation; height_m : (r, c)
+    float32, ellipsoidal, of the surface; NaN where it has none.
     """
 
     tile: TileInputs
     level: PyramidLevel
-    coarser: LevelResult
+    coarser_result: LevelResult
     result: LevelResult
     costs: LevelCosts
     known_costs: NDArray[np.uint8] | None
-    evidence: TableAndCounts | None
+    table_and_counts: TableAndCounts | None
     height_m: NDArray[np.float32]
 
 
@@ -77,12 +77,12 @@ class CellCosts:
     """What decided the height of a cell, by height searched.
 
     heights_m : (h,) float64 ellipsoidal m; cost, known_cost : (h,) uint8, all costs and those of the coarser level's
-    candidates, the latter 0 without them; chosen : which of the heights the semi-global constraint chose; second :
-    height of the secondary minimum of the path costs, m, NaN without one; uniqueness : by how much its sum is larger;
+    candidates, the latter 0 without them; chosen : which of the heights the semi-global constraint chose; second_m :
+    height of the secondary minimum of the path costs, NaN without one; uniqueness : by how much its sum is larger;
     coarser_m : (3,) m, what the coarser level considers here: its height, the second one, that of the least cost on
-    which neighbours agree; coarser_cell_m : side of its cells; height_m : of the surface, NaN without one; pairs :
-    evidence of the pairs of views, none where costs are those of correlation; sees : (i,) bool, which of the views
-    `view_numbers` of the scene take part at the chosen height; covers : (i,) bool, which show the cell at some height.
+    which neighbours agree; coarser_cell_m : side of its cells; height_m : of the surface, NaN without one;
+    pair_evidence : of the pairs of views, none where costs are those of correlation; view_numbers : views of the tile;
+    sees : (i,) bool, which of them take part at the chosen height.
     """
 
     heights_m: FloatArray
@@ -94,17 +94,16 @@ class CellCosts:
     coarser_m: FloatArray
     coarser_cell_m: float
     height_m: float
-    pairs: tuple[PairEvidence, ...]
+    pair_evidence: tuple[PairEvidence, ...]
     view_numbers: tuple[int, ...]
     sees: NDArray[np.bool_]
-    covers: NDArray[np.bool_]
 
 
 def match_with_costs(tile: TileInputs) -> MatchedCosts | None:
     """Match a tile again and keep the costs of its finest level; None where no two views see its core."""
     if len(tile.view_numbers) < PAIR:
         return None
-    kept: list[LevelCosts] = []
+    all_level_costs: list[LevelCosts] = []
 
     def match(
         tile: TileInputs, level: PyramidLevel, prior: SearchPrior, pair_labels: PairLabels | None,
@@ -114,14 +113,14 @@ def match_with_costs(tile: TileInputs) -> MatchedCosts | None:
         if level.number == 0:
             # Both are changed while the result is made.
             chosen_views = replace(costs.chosen_views, matched=costs.chosen_views.matched.copy())
-            kept[:] = [replace(costs, cost=costs.cost.copy(), chosen_views=chosen_views)]
+            all_level_costs[:] = [replace(costs, cost=costs.cost.copy(), chosen_views=chosen_views)]
         return result_of_costs(tile, level, costs)
 
     levels = match_all_levels(tile, match)
     if len(levels.results) == 1:
         return None
     coarser, result = levels.results[-2:]
-    (costs,) = kept
+    (costs,) = all_level_costs
     known_costs = None
     if costs.has_known_costs:
         slope_surface = costs.search.slope_surface
@@ -169,12 +168,11 @@ def cell_costs(matched_costs: MatchedCosts, row: int, col: int) -> CellCosts | N
         second_m=np.nan if second == best else lattice.height_origin + second * lattice.height_step,
         uniqueness=int(result.heights.uniqueness[r, c]),
         coarser_m=_coarser_heights(matched_costs, row, col),
-        coarser_cell_m=matched_costs.coarser.level.cell_size,
+        coarser_cell_m=matched_costs.coarser_result.level.cell_size,
         height_m=float(matched_costs.height_m[r, c]),
-        pairs=_pairs_at(matched_costs, r, c),
+        pair_evidence=_pairs_at(matched_costs, r, c),
         view_numbers=tuple(matched_costs.tile.view_numbers),
         sees=sees(matched, np.full(1, first + chosen, np.float32)),
-        covers=covers(matched),
     )
 
 
@@ -188,7 +186,7 @@ def _place_of(layout: VolumeLayout, r: int, c: int) -> tuple[int, int, int]:
 
 def _coarser_heights(matched_costs: MatchedCosts, row: int, col: int) -> FloatArray:
     """Heights (3,) m that the coarser level considers at a finest cell, see `candidates`."""
-    coarser = matched_costs.coarser
+    coarser = matched_costs.coarser_result
     window = coarser.level.window
     r, c = (row >> 1) - window.row, (col >> 1) - window.col
     r, c = min(max(r, 0), window.rows - 1), min(max(c, 0), window.cols - 1)
@@ -198,7 +196,7 @@ def _coarser_heights(matched_costs: MatchedCosts, row: int, col: int) -> FloatAr
 
 def _pairs_at(matched_costs: MatchedCosts, r: int, c: int) -> tuple[PairEvidence, ...]:
     """Evidence of the pairs of views that cover a cell of the window, those that count most first."""
-    evidence, costs, numbers = matched_costs.evidence, matched_costs.costs, matched_costs.tile.view_numbers
+    evidence, costs, numbers = matched_costs.table_and_counts, matched_costs.costs, matched_costs.tile.view_numbers
     if evidence is None:
         return ()
     visible = costs.chosen_views.matched
@@ -240,7 +238,7 @@ def _only(visible: VisibleHeights, views: tuple[int, int]) -> VisibleHeights:
 
 def _costs_of_block(
     matched_costs: MatchedCosts,
-    evidence: TableAndCounts,
+    table_and_counts: TableAndCounts,
     visible: VisibleHeights,
     place: tuple[int, int],
     n_covering: int,
@@ -264,12 +262,12 @@ def _costs_of_block(
     n_heights = int(lattice.count[b, d])
     one = replace(lattice, shape=(rows, cols), first=lattice.first[b : b + 1, d : d + 1].copy(),
                   count=lattice.count[b : b + 1, d : d + 1].copy())  # fmt: skip
-    table = evidence.table._replace(
+    table = table_and_counts.table._replace(
         unit=UNIT_OF_PAIR, small_window_unit=UNIT_OF_PAIR, max_cost=np.float32(255.0), best_share=np.float32(1.0)
     )
     volume = np.zeros(rows * cols * n_heights, np.uint8)
     parameters = cost_parameters(options, CountedPairs.of(matched_costs.tile))
-    withheld = TableAndCounts(table, evidence.learning, NO_COST_IS_FAR)
+    withheld = TableAndCounts(table, table_and_counts.learning, NO_COST_IS_FAR)
     tile_costs(of_block, slope, one.layout, windows, visible, parameters, withheld, volume)
     return volume.reshape(rows, cols, n_heights)
 

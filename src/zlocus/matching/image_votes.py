@@ -50,7 +50,9 @@ class ImageVote:
     n_others: int
 
 
-def image_votes(windows: NDArray[np.floating], takes_part: NDArray[np.bool_], height: int) -> list[ImageVote | None]:
+def votes_of_images(
+    windows: NDArray[np.floating], takes_part: NDArray[np.bool_], height: int
+) -> list[ImageVote | None]:
     """The vote of every image on a height; None of images that do not take part, or show no window at that height.
 
     windows : (i, h, k), NaN where an image does not show them; takes_part : (i,), which images are not occluded;
@@ -60,18 +62,18 @@ def image_votes(windows: NDArray[np.floating], takes_part: NDArray[np.bool_], he
     known = np.where(shown[..., None], windows, 0.0).astype(np.float64)
     total, count = known.sum(axis=0), shown.sum(axis=0)
     n_taking_part = int(shown[:, height].sum())
-    votes: list[ImageVote | None] = []
+    image_votes: list[ImageVote | None] = []
     for i in range(len(windows)):
         if not shown[i, height] or n_taking_part < 2:
-            votes.append(None)
+            image_votes.append(None)
             continue
         rest, n_rest = total - known[i], count - shown[i]
         own = _mean((known[i] * rest).sum(axis=-1), np.where(shown[i], n_rest, 0))
         # The sum of the products of all pairs is half of the square of the sum less the squares.
         squares = np.where(np.arange(len(windows))[:, None] == i, 0.0, shown).sum(axis=0)
         others = _mean(((rest * rest).sum(axis=-1) - squares) / 2, n_rest * (n_rest - 1) / 2)
-        votes.append(_vote(own, others, height, n_taking_part))
-    return votes
+        image_votes.append(_vote(own, others, height, n_taking_part))
+    return image_votes
 
 
 def _mean(total: FloatArray, count: NDArray[np.floating]) -> FloatArray:
