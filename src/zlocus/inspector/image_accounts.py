@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zlocus.core.options import RunConfig, large_window_side
 from zlocus.core.options.option_fields import value_of
 from zlocus.core.scene import View
-from zlocus.core.sensor_model import FloatArray
+from zlocus.core.sensor_model import FloatArray, lowest_station
 from zlocus.inspector.folder import SurfaceFolder
 from zlocus.inspector.profile import cells_of, values_at
 from zlocus.io.open_raster import cached_raster
@@ -134,6 +134,8 @@ def _occluder(cell: LookedAtCell, view: View, is_eroded: bool = False) -> Occlud
 
     margin_m = value_of(cell.config.cost, "occlusion_margin_steps") * cell.match_scene.height_step
     top_m = min(_highest(folder) + undulation_m, cell.match_scene.z_range[1])
+    station_m = lowest_station([view.sensor])
+    top_m = top_m if station_m is None else min(top_m, station_m)
     return occluder_of(view.sensor, cell.place.xyz, heights_at, top_m, folder.cell_m, margin_m)
 
 

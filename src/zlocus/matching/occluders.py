@@ -10,6 +10,8 @@ import numpy as np
 
 from zlocus.core.sensor_model import FloatArray, SensorModel
 
+# Points of a ray that are computed; others lie on straight lines between them.
+NODES = 9
 # Cells between the places at which a ray is compared with the surface, and at how many places at most.
 STEP_CELLS, MAX_PLACES = 0.5, 20_000
 # Heights (n,) m of the surface at ground points (n, 2) m, NaN where it has none.
@@ -40,17 +42,15 @@ def occluder_of(
     """
     if not top_m > xyz[2]:
         return None
-    xy = sensor.image_from_ground(xyz[None])
-    end = sensor.ground_from_image(xy, np.array([top_m]))[0]
-    length = float(np.hypot(*(end - xyz)[:2]))
+    xy, at_nodes = sensor.image_from_ground(xyz[None]), np.linspace(0.0, 1.0, NODES)
+    nodes = sensor.ground_from_image(np.broadcast_to(xy, (NODES, 2)), xyz[2] + (top_m - xyz[2]) * at_nodes)
+    length = float(np.hypot(*(nodes[-1] - xyz)[:2]))
     if not math.isfinite(length) or length == 0:
         return None
     n = min(math.ceil(length / (STEP_CELLS * cell_m)), MAX_PLACES)
-    z = xyz[2] + (top_m - xyz[2]) * np.arange(1, n + 1) / n
-    ray = sensor.ground_from_image(np.broadcast_to(xy, (n, 2)), z)
-    ray = ray[np.isfinite(ray).all(axis=1)]
+    ray = np.column_stack([np.interp(np.arange(1, n + 1) / n, at_nodes, values) for values in nodes.T])
     # The cell itself does not occlude its middle.
-    ray = ray[np.abs(ray[:, :2] - xyz[:2]).max(axis=1, initial=0.0) > cell_m / 2] if len(ray) else ray
+    ray = ray[np.abs(ray[:, :2] - xyz[:2]).max(axis=1) > cell_m / 2]
     excess = heights_at(ray[:, :2]) - ray[:, 2]
     above = np.flatnonzero(excess > margin_m)
     if not len(above):
