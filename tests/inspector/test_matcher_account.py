@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,18 @@ import rasterio
 
 from rendered_scenes import CENTRE
 from zlocus.core.errors import ConfigError, GeometryError
-from zlocus.inspector.matcher_account import matched_part, matcher_record
+from zlocus.core.grid import CellWindow
+from zlocus.inspector.matcher_account import (
+    MatchedPart,
+    WeighedCell,
+    coarser_level,
+    constraint,
+    evidence,
+    matched_part,
+    matcher_record,
+    repeated,
+)
+from zlocus.matching.cell_costs import CellCosts, PairEvidence
 
 BESIDE_THE_BLOCK = (CENTRE[0] - 2.25, CENTRE[1] + 0.25)
 
@@ -83,6 +95,47 @@ def test_evidence_is_told_of_each_pair(block, monkeypatch):
     assert f"{n_for or 'None'} speak" in text
     assert f"{n_against or 'none'} against it." in text
     assert "adds no cost to it." in text
+
+
+def weighed(*log_ratios):
+    """A cell of one height, with the evidence of each pair of three images."""
+    pairs = tuple(
+        PairEvidence(views, np.array([ratio]), 1.0, np.array([np.isfinite(ratio) and ratio > 0]))
+        for views, ratio in zip(((0, 1), (0, 2), (1, 2)), log_ratios, strict=True)
+    )
+    costs = CellCosts(
+        np.array([50.0]), np.array([40], np.uint8), np.array([7], np.uint8), 0, np.nan, 65535, np.full(3, 51.0), 1.0,
+        50.0, pairs, (0, 1, 2), np.ones(3, bool),
+    )  # fmt: skip
+    scene = SimpleNamespace(height_step=0.5, views=[SimpleNamespace(name=name) for name in "abc"])
+    part = MatchedPart(CellWindow(0, 0, 300, 300), False, None)
+    return WeighedCell(costs, part, scene, 10.0, 40.0, "mvll-sgm", 30.0)
+
+
+def test_pairs_are_counted_by_what_they_say():
+    said = evidence(weighed(2.5, 0.1, -0.5))
+    assert "Of 3 pairs of images 3 see the cell" in said
+    assert "1 speaks for this height and 1 against it. 1 says nothing." in said
+    assert said.endswith(
+        "That of a and b is the strongest: windows so alike are 12 times more frequent at right heights."
+    )
+    said = evidence(weighed(np.nan, -0.1, -1.5))
+    assert "Of 3 pairs of images 2 see the cell" in said
+    assert "None speaks for this height and 1 against it." in said
+    assert "No pair of images sees the cell" in evidence(weighed(np.nan, np.nan, np.nan))
+
+
+def test_prior_and_constraint_are_told_above_the_vertical_datum():
+    cell = weighed(1.0, 1.0, 1.0)
+    found, prior = coarser_level(cell)
+    assert found == (
+        "The coarser level, with cells of 1 m, found 41.00 m here. So 1 heights, from 40.00 m to 40.00 m, were "
+        "searched in this cell."
+    )
+    assert "adds a cost of 7 to it, of 30 at most" in prior
+    assert constraint(cell) == ["The cost of the cell itself is least at the chosen height of 40.00 m: 40."]
+    assert repeated(cell).endswith("The cell gets the height of the surface again.")
+    assert "0.50 m from that of the surface. Evidence" in repeated(replace(cell, surface_m=40.5))
 
 
 def test_runs_that_weighed_no_costs_of_cells_say_so(block):

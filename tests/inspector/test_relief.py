@@ -7,6 +7,7 @@ import pytest
 
 from zlocus.inspector.folder import Patch
 from zlocus.inspector.relief import MAX_SLOPE, TO_BELOW, TO_RIGHT, breaks_of, jump_m, relief_of
+from zlocus.inspector.server import page_files
 from zlocus.matching.height_checks import MAX_DIFFERENCE_WITHOUT_JUMP_STEPS
 
 JUMP_M = 2.0
@@ -19,6 +20,12 @@ def test_it_is_broken_along_the_edges_of_a_block_only():
     right, below = (breaks & TO_RIGHT) > 0, (breaks & TO_BELOW) > 0
     assert sorted(zip(*np.nonzero(right), strict=True)) == [(2, 2), (2, 4), (3, 2), (3, 4)]
     assert sorted(zip(*np.nonzero(below), strict=True)) == [(1, 3), (1, 4), (3, 3), (3, 4)]
+
+
+def test_the_page_reads_the_same_bits():
+    script = page_files()["js/relief.js"][0].decode()
+    assert f"const TO_RIGHT = {TO_RIGHT}, TO_BELOW = {TO_BELOW};" in script
+    assert (TO_RIGHT, TO_BELOW) == (1, 2)
 
 
 def test_slopes_and_small_steps_are_whole_and_holes_break_nothing():

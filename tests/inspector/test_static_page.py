@@ -14,7 +14,7 @@ import rasterio
 
 from browser import found_browser
 from inspected import a_cell, served
-from rendered_scenes import SMALL_TILES, run
+from rendered_scenes import CENTRE, SMALL_TILES, run
 from zlocus.evaluation.comparison import Comparison
 from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.restored_run import restored
@@ -441,6 +441,37 @@ def test_the_surface_is_shown_in_three_dimensions(page, inspected, tmp_path):
 
     drawn = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50  # the ortho-image is on it
+
+
+def test_a_block_has_plain_walls_and_its_shadow_a_line_to_it(browser, block):
+    folder, _ = block
+    with served(folder.out) as (inspection, address):
+        x, y = folder.centre_of(*folder.cell_of(CENTRE[0] - 2.25, CENTRE[1] + 0.25))
+        page = browser.new_context(viewport=DESK).new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.goto(f"{address}#tab=relief&cell={x},{y}")
+        page.wait_for_selector("#relief-view[data-places]")
+        assert int(page.locator("#relief-view").get_attribute("data-walls")) > 100
+        bare = pixels_of(page)
+        page.locator("#walls").uncheck()
+        assert (pixels_of(page) != bare).any()
+        page.locator("#tab-cell").click()
+        match_scene(page)
+        account = page.locator("#accounts li.occluded")
+        assert account.count() == 1
+        assert account.inner_text().startswith("aft is occluded.")
+        # The cell, the circle around it, the ties and, for the occluder, a line with its edge and its end.
+        n_ties = page.locator("#map path.leaflet-interactive").count()
+        assert page.locator("#map path").count() >= n_ties + 5
+        page.context.close()
+
+
+def pixels_of(page) -> np.ndarray:
+    """What the view in three dimensions shows."""
+    import cv2
+
+    content = page.locator("#relief-view canvas").screenshot()
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
 
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (DESK, "dark"), (PHONE, "light"), (PHONE, "dark")])

@@ -199,8 +199,8 @@ def evidence(cell: WeighedCell) -> str:
     n_silent = len(seen) - n_for - n_against
     votes = f"{n_for or 'None'} {_verb(n_for)} for this height and {n_against or 'none'} against it."
     votes += f" {n_silent} {'says' if n_silent == 1 else 'say'} nothing." if n_silent else ""
-    which = f"The {n_counting} that speak most for it count."
-    most = f"The strongest evidence is that of {cell.names(strongest)}: {_odds(strongest.log_ratio[costs.chosen])}."
+    which = f"The evidence of the {n_counting} that speak most for it counts."
+    most = f"That of {cell.names(strongest)} is the strongest: {_odds(strongest.log_ratio[costs.chosen])}."
     return f"{of_all} {votes} {which} {most}"
 
 
