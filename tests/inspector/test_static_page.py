@@ -20,7 +20,7 @@ from zlocus.inspector.cell import WhatIf
 from zlocus.inspector.restored_run import restored
 from zlocus.matching.point_match import curves_at
 from zlocus.pipeline.report_inputs import SHOWN_WITHIN_CELLS, place_of_cell
-from zlocus.products.point_report import PointReport
+from zlocus.products.point_report import LABELS, PointReport
 
 LAYERS = ["hillshade", "ortho", "height", "sigma", "views", "quality", "dtm", "above", "difference"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
@@ -158,8 +158,8 @@ def agrees(table, report: PointReport) -> None:
     single, mean = report.curves.single_curves, report.curves.mean_curves
     for j, name in enumerate(report.search):
         row = table[name]
-        assert number(row["label"]) == single.labels[j]
-        assert number(row["mean"]) == mean.labels[j]
+        assert row["label"] == LABELS[single.labels[j]]
+        assert row["mean"] == LABELS[mean.labels[j]]
         assert number(row["rho1"]) == pytest.approx(single.peaks.rho1[j], abs=SHOWN_RHO)
         if np.isfinite(single.peaks.ratio[j]):
             assert number(row["ratio"]) == pytest.approx(single.peaks.ratio[j], abs=SHOWN_RATIO)
@@ -445,7 +445,7 @@ def test_the_surface_is_shown_in_three_dimensions(page, inspected, tmp_path):
 
 def test_a_block_has_plain_walls_and_its_shadow_a_line_to_it(browser, block):
     folder, _ = block
-    with served(folder.out) as (inspection, address):
+    with served(folder.out) as (_, address):
         x, y = folder.centre_of(*folder.cell_of(CENTRE[0] - 2.25, CENTRE[1] + 0.25))
         page = browser.new_context(viewport=DESK).new_page()
         page.set_default_timeout(WAIT_MS)

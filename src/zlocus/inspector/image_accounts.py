@@ -171,7 +171,10 @@ def _occluded(cell: LookedAtCell, view: View, occluder: Occluder, n_compared: in
     elif _occluder(cell, view, is_eroded=True) is not None:
         fate = "It is left out at this cell, unless too few images would be left."
     else:
-        fate = "The edge is near. The matching allows for an error of one cell there, and compares it all the same."
+        fate = (
+            "Its ray passes close to an edge. The matching allows for an error of one cell there, and compares the image "
+            "all the same."
+        )
     says = (
         f"{view.name} is occluded. It shows the surface {occluder.distance_m:.{digits}f} m away{towards}, at {first} "
         f"{x:.{digits}f}, {second} {y:.{digits}f} m. The surface there is {cell.metres(z)} high, {rise:.{digits}f} m "

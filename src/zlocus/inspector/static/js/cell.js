@@ -378,21 +378,22 @@ function text(value, digits, what, hasPeak = true) {
 }
 
 function label(value, name, what) {
-  return element("td", { class: `label-${value}`, "data-value": what }, `${LABELS[value]} (${signed(value)})`);
+  return element("td", { class: `label-${value}`, "data-value": what }, LABELS[value]);
 }
 
 function tieTable(found) {
   const { points } = found.neighbours, decimals = digitsFor(surface.transform[0]);
   $("ties-say").textContent = found.neighbours.says;
   const caption = element("caption", { class: "hidden" }, "Heights of the tie points around the cell, and how well the images match there");
-  const heads = ["away, m", "height, m", "above surface, m", ...found.curves.map(({ image }) => image)];
+  const heads = [["away, m", "Distance from the cell"], ["height, m", "Height of the tie point"], ["above, m", "Height above the surface there"],
+    ...found.curves.map(({ image }) => [image, `How well ${image} matches the reference image there`])];
   const rows = points.slice(0, 12).map((point) => element("tr", {}, element("th", { scope: "row" }, point.distance_m.toFixed(decimals - 1)),
     element("td", {}, point.height_m.toFixed(decimals)),
     element("td", {}, point.above_surface_m === null ? "–" : signed(point.above_surface_m.toFixed(decimals))),
     ...point.labels.map((value) => element("td", { class: `label-${value}` }, LABELS[value]))));
   if (points.length > rows.length) rows.push(element("tr", {}, element("td", {}, `and ${points.length - rows.length} more`)));
   if (!points.length) rows.push(element("tr", {}, element("td", {}, "none is near enough")));
-  $("ties").replaceChildren(caption, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head))), ...rows);
+  $("ties").replaceChildren(caption, element("tr", {}, ...heads.map(([head, meaning]) => element("th", { scope: "col", title: meaning }, head))), ...rows);
 }
 
 function switchImage(name, isOn) {
