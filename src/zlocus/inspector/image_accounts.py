@@ -172,8 +172,8 @@ def _occluded(cell: LookedAtCell, view: View, occluder: Occluder, n_compared: in
         fate = "It is left out at this cell, unless too few images would be left."
     else:
         fate = (
-            "Its ray passes close to an edge. The matching allows for an error of one cell there, and compares the image "
-            "all the same."
+            "Its ray passes close to an edge. The matching allows for an error of one cell there, and compares the "
+            "image all the same."
         )
     says = (
         f"{view.name} is occluded. It shows the surface {occluder.distance_m:.{digits}f} m away{towards}, at {first} "
