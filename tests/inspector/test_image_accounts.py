@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,6 +66,27 @@ def test_a_falsified_image_is_out_voted_by_the_others(block):
     # Its pixels were moved along the flight, so that it matches where the parallax is as large.
     assert abs(best_m - GROUND_M) > 3.0
     assert record["accounts_say"] == "Of 3 images 2 agree and 1 is out-voted."
+
+
+def test_images_that_the_selection_does_not_choose_say_why(block):
+    """With --selection guided the match of a cell ends before the last image where the mean is good enough."""
+    folder, scene = block
+    request = folder.run["config"]["request"] | {"selection": "guided"}
+    guided = replace(folder, run=folder.run | {"config": folder.run["config"] | {"request": request}})
+    xy = folder.centre_of(*folder.cell_of(CENTRE[0] - 14.0, CENTRE[1] - 8.0))
+    few = WhatIf(selection={"min_images": 1, "max_sigma_steps": 1000.0})
+    record = match_record(guided, scene, xy, GROUND_M, few)
+    stop = record["match"]["stop"]
+    assert (stop["images"], stop["is_stopped"]) == (1, True)
+    last = record["match"]["curves"][1]["image"]
+    account = {each["image"]: each for each in record["accounts"]}[last]
+    assert account["kind"] == "not chosen"
+    assert account["says"].startswith(
+        f"{last} is not chosen. It comes at place 2 of the search images, and the mean of those before it is good enough."
+    )
+    assert record["accounts_say"] == "Of 3 images 2 agree and 1 is not chosen."
+    as_run = match_record(folder, scene, xy, GROUND_M, few)  # this run compares all images
+    assert {each["kind"] for each in as_run["accounts"]} == {"agrees"}
 
 
 def test_where_an_image_ends_it_says_on_which_side(block):

@@ -29,7 +29,8 @@ COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "
 KINDS = {
     "agrees": ("agrees", "agree"), "undecided": ("cannot tell the height", "cannot tell the height"),
     "occluded": ("is occluded", "are occluded"), "out-voted": ("is out-voted", "are out-voted"),
-    "overruled": ("is overruled", "are overruled"), "masked": ("is masked", "are masked"),
+    "overruled": ("is overruled", "are overruled"),
+    "not chosen": ("is not chosen", "are not chosen"), "masked": ("is masked", "are masked"),
     "not compared": ("is not compared", "are not compared"), "outside": ("does not show it", "do not show it"),
 }  # fmt: skip
 UNLIMITED_M = math.inf
@@ -222,7 +223,25 @@ def _account_of_vote(cell: LookedAtCell, view: View, image_votes: dict[str, Imag
         Vote.OUT_VOTED: f"{name} is out-voted. {own}. It would match best at {peak}, with {most}. {others}",
         Vote.OVERRULED: f"{name} is overruled. {own}, and {most} at {peak}. {_overruled_by(image_vote)}",
     }[image_vote.vote]
-    return _record(view, image_vote.vote.value, says)
+    why = _why_not_chosen(cell, place_curves, name)
+    return _record(view, image_vote.vote.value, says) if not why else _record(view, "not chosen", f"{why} {says}")
+
+
+def _why_not_chosen(cell: LookedAtCell, place_curves: PlaceCurves, name: str) -> str:
+    """Why the rule of --selection guided does not choose an image for a cell; "" where it does, or the run has no such
+    rule."""
+    curves = place_curves.curves
+    search = [place_curves.views[i].name for i in curves.order.search]
+    is_guided = cell.folder.run["config"]["request"].get("selection") == "guided"
+    if not is_guided or name not in search[curves.n_used :]:
+        return ""
+    rank = search.index(name)
+    if not curves.order.is_helpful[rank]:
+        return f"{name} is not chosen, because its labels at the tie points around sum to {curves.order.accumulated[rank]:+d}."
+    enough = (
+        "the mean of those before it is good enough" if curves.is_stopped else "no more images are allowed (max_images)"
+    )
+    return f"{name} is not chosen. It comes at place {rank + 1} of the search images, and {enough}."
 
 
 def _overruled_by(image_vote: ImageVote) -> str:
