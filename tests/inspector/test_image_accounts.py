@@ -82,7 +82,8 @@ def test_images_that_the_selection_does_not_choose_say_why(block):
     account = {each["image"]: each for each in record["accounts"]}[last]
     assert account["kind"] == "not chosen"
     assert account["says"].startswith(
-        f"{last} is not chosen. It comes at place 2 of the search images, and the mean of those before it is good enough."
+        f"{last} is not chosen. It comes at place 2 of the search images, and the mean of those before it is good "
+        "enough."
     )
     assert record["accounts_say"] == "Of 3 images 2 agree and 1 is not chosen."
     as_run = match_record(folder, scene, xy, GROUND_M, few)  # this run compares all images

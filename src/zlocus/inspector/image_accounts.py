@@ -237,10 +237,11 @@ def _why_not_chosen(cell: LookedAtCell, place_curves: PlaceCurves, name: str) ->
         return ""
     rank = search.index(name)
     if not curves.order.is_helpful[rank]:
-        return f"{name} is not chosen, because its labels at the tie points around sum to {curves.order.accumulated[rank]:+d}."
-    enough = (
-        "the mean of those before it is good enough" if curves.is_stopped else "no more images are allowed (max_images)"
-    )
+        labels = curves.order.accumulated[rank]
+        return f"{name} is not chosen, because its labels at the tie points around sum to {labels:+d} only."
+    enough = "no more images are allowed (max_images)"
+    if curves.is_stopped:
+        enough = "the mean of those before it is good enough"
     return f"{name} is not chosen. It comes at place {rank + 1} of the search images, and {enough}."
 
 
