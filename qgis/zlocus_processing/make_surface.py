@@ -36,8 +36,8 @@ METHOD_NAMES = (
     "image space with semi-global constraint (gc3-sgm)",
 )  # fmt: skip
 FILLS = ("none", "interpolate", "dem")
-MAPS = ("contours", "dtm", "laz")
-MAP_NAMES = ("contours", "terrain without buildings and trees", "points (LAZ)")
+MAPS = ("contours", "dtm", "laz", "copc")
+MAP_NAMES = ("contours", "terrain without buildings and trees", "points (LAZ)", "points (COPC)")
 # Outputs that are rasters, by their names.
 RASTERS = {"DSM": "dsm.tif", "SIGMA": "sigma.tif", "QUALITY": "quality.tif", "VIEWS": "views.tif", "ORTHO": "ortho.tif"}
 

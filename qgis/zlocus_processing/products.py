@@ -20,8 +20,8 @@ from .algorithm import OUTPUT, ZlocusAlgorithm, is_empty
 from .results import MAPS, SURFACE
 
 NAMES = tuple(MAPS)
-TITLES = ("contours", "terrain without buildings and trees", "hillshade", "points (LAZ)")
-OUTPUTS = {"CONTOURS": "contours", "DTM": "dtm", "HILLSHADE": "hillshade", "POINTS": "laz"}
+TITLES = ("contours", "terrain without buildings and trees", "hillshade", "points (LAZ)", "points (COPC)")
+OUTPUTS = {"CONTOURS": "contours", "DTM": "dtm", "HILLSHADE": "hillshade", "POINTS": "laz", "COPC": "copc"}
 
 
 class Products(ZlocusAlgorithm):
@@ -45,7 +45,8 @@ class Products(ZlocusAlgorithm):
         self.addOutput(QgsProcessingOutputVectorLayer("CONTOURS", "Contours"))
         self.addOutput(QgsProcessingOutputRasterLayer("DTM", "Terrain"))
         self.addOutput(QgsProcessingOutputRasterLayer("HILLSHADE", "Hillshade"))
-        self.addOutput(QgsProcessingOutputFile("POINTS", "Points"))
+        self.addOutput(QgsProcessingOutputFile("POINTS", "Points (LAZ)"))
+        self.addOutput(QgsProcessingOutputFile("COPC", "Points (COPC)"))
 
     def folder(self, parameters: dict[str, Any], context: QgsProcessingContext) -> str:
         """The folder of the surface."""

@@ -35,7 +35,10 @@ SURFACE = (
 )
 EVALUATION = (ShownFile("error.tif", "error", True),)
 COMPARISON = (ShownFile("difference.tif", "difference, B less A", True),)
-MAPS = {"contours": "contours.gpkg", "dtm": "dtm.tif", "hillshade": "hillshade.tif", "laz": "surface.laz"}
+MAPS = {
+    "contours": "contours.gpkg", "dtm": "dtm.tif", "hillshade": "hillshade.tif", "laz": "surface.laz",
+    "copc": "surface.copc.laz",
+}  # fmt: skip
 
 
 def shown_files(folder: str, files: tuple[ShownFile, ...]) -> list[ShownFile]:

@@ -100,7 +100,10 @@ class CellCosts:
 
 
 def match_with_costs(tile: TileInputs) -> MatchedCosts | None:
-    """Match a tile again and keep the costs of its finest level; None where no two views see its core."""
+    """Match a tile again and keep the costs of its finest level.
+
+    None where no two views see its core, and where there is no coarser level from which the costs begin.
+    """
     if len(tile.view_numbers) < PAIR:
         return None
     all_level_costs: list[LevelCosts] = []
@@ -117,7 +120,7 @@ def match_with_costs(tile: TileInputs) -> MatchedCosts | None:
         return result_of_costs(tile, level, costs)
 
     levels = match_all_levels(tile, match)
-    if len(levels.results) == 1:
+    if len(levels.results) < 2:
         return None
     coarser, result = levels.results[-2:]
     (costs,) = all_level_costs

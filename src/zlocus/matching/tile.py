@@ -125,7 +125,7 @@ def match_tile(
         return TileResult(Surface.nothing(core_window))
     levels = match_all_levels(tile)
     results, ground = levels.results, levels.ground
-    if len(results) == 1:
+    if not levels.has_overlap:
         return TileResult(Surface.nothing(core_window), results[0].evaluations, results[0].all_images)
     if method != "mvll":
         results[-1] = with_planes_of_segments(results[-1], config)
@@ -141,10 +141,11 @@ def match_tile(
 class TileLevels:
     """The matched levels of a tile.
 
-    results : the coarsest level first, and no other where it finds no overlap in the tile's core; ground : see
-    `ground_of_overlap`; pair_labels : see `CoarsestMatch`.
+    has_overlap : whether the coarsest level finds ground in the tile's core that two views see; results : the coarsest
+    level first, and no other without such ground; ground : see `ground_of_overlap`; pair_labels : see `CoarsestMatch`.
     """
 
+    has_overlap: bool
     results: list[LevelResult]
     ground: OverlapGround
     pair_labels: PairLabels | None
@@ -157,8 +158,8 @@ def match_all_levels(tile: TileInputs, match: MatchLevel | None = None) -> TileL
     result, pair_labels = coarsest_match.result, coarsest_match.pair_labels
     overlap_window = find_overlap_window(result.visible, result.heights.vertex, ground.covered, result.level.window)
     if not tile.core_window.at_level(result.level.number, 0).meets(overlap_window):
-        return TileLevels([result], ground, pair_labels)
-    return TileLevels(match_finer_levels(tile, coarsest_match, overlap_window, match), ground, pair_labels)
+        return TileLevels(False, [result], ground, pair_labels)
+    return TileLevels(True, match_finer_levels(tile, coarsest_match, overlap_window, match), ground, pair_labels)
 
 
 def _tile_result(
