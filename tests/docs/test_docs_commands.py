@@ -300,6 +300,6 @@ def test_blocks_of_commands_are_found():
     steps = [step.text for step in steps_of(ROOT / "docs" / "how-to" / "import.md")]
     assert steps[0] == "zlocus import colmap PROJECT -o scene.yaml"
     assert steps[-1] == "zlocus dsm scene.yaml -o facade"
-    assert len(steps) == 8
+    assert len(steps) == 9
     assert len(steps_of(ROOT / "benchmarks" / "README.md")) > 20
     assert INLINE.findall("as `zlocus dsm IN` says") == ["zlocus dsm IN"]

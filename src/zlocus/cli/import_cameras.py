@@ -37,6 +37,13 @@ class ImportOptions:
         tuple[float, float, float] | None,
         typer.Option(help="Direction that becomes the y axis; needs --up.", metavar="X Y Z"),
     ] = None
+    offset: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="What was subtracted from map coordinates to make the model's (colmap, bundler, eo); needs --crs.",
+            metavar="X Y Z",
+        ),
+    ] = None
     focal: Annotated[float | None, typer.Option(help="Focal length (eo), px.", metavar="PX")] = None
     camera: Annotated[
         Path | None, typer.Option(help="File with the interior orientation (eo), as in scene.yaml.", metavar="FILE")

@@ -354,8 +354,8 @@ class ImportRequest:
 
     kind : format; source : its folder or file. images : folder of the images. crs : of the result. local : in the local
     frame of the source, at no place of the Earth. up : direction, in the axes of the source, that becomes z of a local
-    frame; north : another, that becomes y. focal : px; camera : file with the interior orientation. earth : how a map
-    is understood.
+    frame; north : another, that becomes y. offset : m, what was subtracted from coordinates of `crs` to make those of
+    the source. focal : px; camera : file with the interior orientation. earth : how a map is understood.
 
     Raises
     ------
@@ -371,6 +371,7 @@ class ImportRequest:
     local: bool = False
     up: tuple[float, float, float] | None = None
     north: tuple[float, float, float] | None = None
+    offset: tuple[float, float, float] | None = None
     focal: float | None = None
     camera: Path | None = None
     earth: str | None = None
@@ -389,6 +390,10 @@ class ImportRequest:
                 )
         if self.north is not None and self.up is None:
             raise ConfigError("--north turns the frame about what is up. Give --up too, or leave it out.")
+        if self.offset is not None and not all(map(math.isfinite, self.offset)):
+            raise ConfigError(f"--offset {' '.join(f'{v:g}' for v in self.offset)} is no place. Give finite numbers.")
+        if self.offset is not None and self.crs is None:
+            raise ConfigError("--offset leads to coordinates of a map, and there is none. Give --crs, or leave it out.")
         for one, other in (("crs", "local"), ("crs", "up"), ("focal", "camera")):
             if {one, other} <= set(self.given()):
                 raise ConfigError(f"--{one} and --{other} exclude each other. Leave one out.")
@@ -397,7 +402,8 @@ class ImportRequest:
 
     def given(self) -> list[str]:
         """Names of the options that only some formats know, where they are given."""
-        values = {name: getattr(self, name) for name in ("crs", "local", "up", "north", "focal", "camera", "earth")}
+        names = ("crs", "local", "up", "north", "offset", "focal", "camera", "earth")
+        values = {name: getattr(self, name) for name in names}
         return [name for name, value in values.items() if value not in (None, False)]
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import camera_files as files
 from zlocus.cli.app import app
-from zlocus.core.errors import ConfigError, InputError, OutputError
+from zlocus.core.errors import ConfigError, InputError, OutputError, ZlocusWarning
 from zlocus.core.requests import ImportRequest
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.importers.scene import import_scene
@@ -143,6 +143,30 @@ def test_the_scene_file_is_relative_and_whole(tmp_path):
     assert open_scene([out]).views[0].path.samefile(written.folder / "images/a.tif")
 
 
+def test_a_folder_with_linked_images_can_be_moved(tmp_path):
+    written = files.write_colmap(tmp_path / "project")
+    disk = tmp_path / "disk"
+    (written.folder / "images").rename(disk)
+    (written.folder / "images").symlink_to(disk)
+    import_scene(ImportRequest("colmap", written.folder, written.folder / "scene.yaml"))
+    document = yaml.safe_load((written.folder / "scene.yaml").read_text())
+    assert [view["image"] for view in document["views"]] == [f"images/{name}" for name in files.NAMES]
+    moved = tmp_path / "deep" / "er" / "moved"
+    moved.parent.mkdir(parents=True)
+    written.folder.rename(moved)
+    assert open_scene([moved / "scene.yaml"]).views[0].path.samefile(disk / "a.tif")
+
+
+def test_a_scene_file_in_a_linked_folder_finds_its_images(tmp_path):
+    """The steps up from a linked folder begin at the folder itself, not at the link."""
+    written = files.write_colmap(tmp_path / "project")
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "scenes").symlink_to(tmp_path / "far" / "away")
+    out = tmp_path / "scenes" / "mine.yaml"
+    import_scene(ImportRequest("colmap", written.folder, out))
+    assert open_scene([out]).views[0].path.samefile(written.folder / "images/a.tif")
+
+
 def test_a_scene_file_is_replaced_only_with_overwrite(tmp_path):
     written = files.write_colmap(tmp_path / "p")
     out = tmp_path / "scene.yaml"
@@ -154,6 +178,7 @@ def test_a_scene_file_is_replaced_only_with_overwrite(tmp_path):
     assert out.read_text() != "mine"
 
 
+@pytest.mark.filterwarnings("ignore:The camera centres")
 def test_coordinates_of_a_map_may_be_cartesian(tmp_path):
     """COLMAP's axes laid on a map, and a table of orientations that was adjusted on a flat map."""
     written = files.write_colmap(tmp_path / "p")
@@ -186,6 +211,65 @@ def test_up_becomes_z(tmp_path):
         np.testing.assert_allclose(rotation @ up, [0.0, 0.0, 1.0], atol=1e-12)
         xy = other.sensor.image_from_ground(ground @ rotation.T)
         np.testing.assert_allclose(xy, [[10.0, 20.0], [50.0, 5.0]], atol=SAME_PX)
+
+
+OFFSET = (462_000.0, 5_247_000.0, 400.0)
+# Coordinates of a map in float64, projected with a focal length of 70 px at 100 m.
+WITH_OFFSET_PX = 1e-5
+LOCAL_ON_A_MAP = {"colmap": {}, "bundler": {}, "eo": {"focal": 70.0, "earth": "flat"}}
+
+
+@pytest.mark.parametrize("kind", LOCAL_ON_A_MAP)
+def test_an_offset_leads_from_the_model_to_the_map(kind, tmp_path):
+    assert [name for name, importer in IMPORTERS.items() if "offset" in importer.options] == list(LOCAL_ON_A_MAP)
+    written = getattr(files, f"write_{kind}")(tmp_path / "p")
+    options = LOCAL_ON_A_MAP[kind] | {"crs": "EPSG:32632"}
+    with pytest.warns(ZlocusWarning, match=r"Give with --offset what was subtracted"):
+        there = imported(kind, written, **options)
+    here = imported(kind, written, offset=OFFSET, **options)
+    for one, other in zip(there.views, here.views, strict=True):
+        xy = other.sensor.image_from_ground(files.GROUND + OFFSET)
+        np.testing.assert_allclose(xy, one.sensor.image_from_ground(files.GROUND), rtol=0, atol=WITH_OFFSET_PX)
+
+
+def moved_model(folder, by):
+    """A model of COLMAP whose coordinates lie elsewhere."""
+    written = files.write_colmap(folder)
+    path = folder / "sparse/0/images.txt"
+    lines = path.read_text().splitlines()
+    for number, line in enumerate(lines):
+        fields = line.split()
+        if line.endswith(".tif") and not line.startswith("#"):
+            i = [name.split()[0] for name in files.NAMES].index(fields[9])
+            translation = -files.rotation(i) @ (files.CENTRES[i] + by)
+            lines[number] = " ".join([*fields[:5], *map(repr, map(float, translation)), *fields[8:]])
+    path.write_text("\n".join(lines) + "\n")
+    return written
+
+
+@pytest.mark.parametrize(
+    ("by", "options", "says"),
+    [
+        (OFFSET, {}, r"around X = 462010, Y = 5247000, Z = 500, as coordinates of a map do.*--crs EPSG:n"),
+        ((4_300_000.0, 660_000.0, 4_650_000.0), {}, "as geocentric coordinates do.*enu"),
+        (OFFSET, {"crs": "EPSG:32612"}, None),  # a zone elsewhere cannot be told from the right one
+        ((2_600_000.0, 1_200_000.0, 400.0), {"crs": "EPSG:32632"}, "outside the area in which EPSG:32632 is used"),
+        (OFFSET, {"crs": "EPSG:32632", "offset": OFFSET}, "Check --offset and --crs"),
+        (OFFSET, {"crs": "EPSG:32632"}, None),
+        (OFFSET, {"crs": "EPSG:3857"}, None),  # used in the whole world
+        (OFFSET, {"up": (0.0, 0.0, 1.0)}, None),
+        ((900.0, -400.0, 0.0), {}, None),
+    ],
+)  # fmt: skip
+def test_places_that_cannot_be_meant_are_warned_of(by, options, says, tmp_path):
+    written = moved_model(tmp_path / "p", np.array(by))
+    request = ImportRequest("colmap", written.folder, tmp_path / "scene.yaml", **options)
+    if says is None:
+        import_scene(request)
+        return
+    with pytest.warns(ZlocusWarning, match=says) as caught:
+        import_scene(request)
+    assert len(caught) == 1
 
 
 def remade(path, old, new):
@@ -257,6 +341,9 @@ def test_options_that_do_not_apply_are_refused(tmp_path):
         (lambda: ImportRequest("eo", folder, out, earth="flat"), "Give --crs"),
         (lambda: ImportRequest("eo", folder, out, up=(0.0, 0.0, 0.0)), "no direction"),
         (lambda: ImportRequest("opensfm", folder, out, crs="EPSG:32632", local=True), "exclude each other"),
+        (lambda: ImportRequest("colmap", folder, out, offset=(1.0, 2.0, 3.0)), "Give --crs"),
+        (lambda: ImportRequest("colmap", folder, out, crs="EPSG:32632", offset=(1.0, np.inf, 3.0)), "no place"),
+        (lambda: ImportRequest("opensfm", folder, out, crs="EPSG:32632", offset=OFFSET), "--offset says nothing"),
     ):
         with pytest.raises(ConfigError, match=says):
             import_scene(request())

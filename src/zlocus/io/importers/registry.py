@@ -23,9 +23,9 @@ class Importer:
 
 
 IMPORTERS = {
-    "colmap": Importer(read_colmap, ("crs", "up", "north")),
+    "colmap": Importer(read_colmap, ("crs", "up", "north", "offset")),
     "opensfm": Importer(read_opensfm, ("crs", "local")),
     "metashape": Importer(read_metashape, ("crs", "up", "north")),
-    "bundler": Importer(read_bundler, ("crs", "up", "north")),
-    "eo": Importer(read_eo, ("crs", "up", "north", "focal", "camera", "earth")),
+    "bundler": Importer(read_bundler, ("crs", "up", "north", "offset")),
+    "eo": Importer(read_eo, ("crs", "up", "north", "offset", "focal", "camera", "earth")),
 }

@@ -14,6 +14,7 @@ from zlocus.core.requests import ImportRequest
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.importers.base import ImportedCameras, ImportedExposure
 from zlocus.io.importers.earth import parsed_crs, scene_file_crs
+from zlocus.io.importers.place import placed_cameras
 from zlocus.io.importers.registry import IMPORTERS
 from zlocus.io.open_raster import open_raster
 from zlocus.io.safe_text import EXPORT_AGAIN
@@ -46,7 +47,10 @@ def import_scene(request: ImportRequest) -> SceneFile:
             raise ConfigError(f"--{name} says nothing to an import of {request.kind}. Leave it out.")
     if request.out.exists() and not request.overwrite:
         raise OutputError(f"{request.out} exists already. Choose another name with -o, or add --overwrite.")
-    scene = scene_of(importer.read(request), request)
+    cameras = importer.read(request)
+    if "offset" in importer.options:
+        cameras = placed_cameras(cameras, request)
+    scene = scene_of(cameras, request)
     write_scene_file(request.out, scene)
     return scene
 
@@ -149,5 +153,11 @@ def _names(exposures: Sequence[ImportedExposure]) -> list[str]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A path relative to the folder of the scene file, as it is written there."""
-    return Path(os.path.relpath(path.resolve(), folder)).as_posix()
+    """A path relative to the folder of the scene file, as it is written there.
+
+    Links on the way to the image stay as they are, so that a folder with a link to its images can be moved. They are
+    followed where the steps up from the folder (`..`) would otherwise lead elsewhere.
+    """
+    found = [Path(os.path.relpath(each, folder)) for each in (path.absolute(), path.resolve())]
+    is_same = os.path.exists(folder / found[0]) and os.path.samefile(folder / found[0], path)
+    return found[0 if is_same else 1].as_posix()
