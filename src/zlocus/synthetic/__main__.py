@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 def main(arguments: list[str] | None = None) -> int:
     """Render the scene that the command line describes, and return the exit status."""
+    from zlocus.synthetic.delivered import deliver
     from zlocus.synthetic.drone_block import DroneBlockSpec, render_drone_block, small_drone_block_spec
+    from zlocus.synthetic.drone_projects import write_projects
     from zlocus.synthetic.files import render_scene
     from zlocus.synthetic.linescan import TrajectoryNoise
     from zlocus.synthetic.mixed import render_mixed_scene
@@ -28,7 +30,13 @@ def main(arguments: list[str] | None = None) -> int:
             render_mixed_scene(_spec(given), given.output, _say)
         elif given.kind in ("drone", "small-drone"):
             make_block = small_drone_block_spec if given.kind == "small-drone" else DroneBlockSpec
-            render_drone_block(make_block(seed=given.seed), given.output, _say)
+            block = make_block(seed=given.seed)
+            rendered = render_drone_block(block, given.output, _say)
+            if given.projects:
+                write_projects(block, rendered)
+        elif given.delivery:
+            spec = _spec(given)
+            deliver(spec, render_scene(spec, given.output, _say))
         else:
             linescan = TrajectoryNoise(*given.trajectory_noise) if given.cameras == "linescan" else None
             render_scene(_spec(given), given.output, _say, linescan)
@@ -46,14 +54,20 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m zlocus.synthetic", description="Render a scene with exact truth.")
     parser.add_argument("-o", "--output", type=Path, required=True, help="new folder for images and truth")
     parser.add_argument(
-        "--kind", choices=("city", "hills", "real", "demo", "mixed", "drone", "small-drone"), default="city",
-        help="real: as hard as real images; drone: 20 frames of 12 Mpx; small-drone: 6 small ones (both: --seed only); "
-        "mixed: ground like that of the demo, seen by three kinds of sensor (uses --seed and --size)",
+        "--kind", choices=("city", "hills", "real", "dates", "demo", "mixed", "drone", "small-drone"),
+        default="city",
+        help="real: as hard as real images; dates: 19 images of as many days, or --views; drone: 20 frames of 12 Mpx; "
+        "small-drone: 6 small ones (both: --seed only); mixed: ground like that of the demo, seen by three kinds of "
+        "sensor (uses --seed and --size)",
     )  # fmt: skip
     parser.add_argument("--trouble", metavar="NAME", help="paint one trouble into a town: lake, glitter, snow ...")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--size", type=int, help="side of the area with truth, in ground pixels")
     parser.add_argument("--views", type=int, help="render only the first N views")
+    parser.add_argument("--delivery", action="store_true", help="write the images as a vendor ships them (with RPCs)")
+    parser.add_argument(
+        "--projects", action="store_true", help="write the cameras as OpenDroneMap and COLMAP do (drone, small-drone)"
+    )
     parser.add_argument("--pointing", type=float, default=0.0, metavar="PX", help="largest pointing error of the RPCs")
     parser.add_argument(
         "--cameras", choices=("rpc", "linescan"), default="rpc",
@@ -74,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _spec(given: argparse.Namespace) -> SceneSpec:
     """The scene that the command line describes."""
+    from zlocus.synthetic.many_dates import N_IMAGES, many_dates_spec
     from zlocus.synthetic.realistic import realistic_spec
     from zlocus.synthetic.scenes import (
         LARGE_SIZE,
@@ -85,7 +100,10 @@ def _spec(given: argparse.Namespace) -> SceneSpec:
         with_pointing_errors,
     )
 
-    make: dict[str, Callable[[int], SceneSpec]] = {"city": city_spec, "hills": hills_spec, "real": realistic_spec}
+    make: dict[str, Callable[[int], SceneSpec]] = {
+        "city": city_spec, "hills": hills_spec, "real": realistic_spec,
+        "dates": lambda seed: many_dates_spec(seed, given.views or N_IMAGES),
+    }  # fmt: skip
     spec = make.get(given.kind, demo_spec)(given.seed)
     if given.trouble:
         spec = trouble_spec(given.trouble, given.seed)

@@ -20,6 +20,7 @@ from zlocus.core.errors import OutputError
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.rpc import RpcCoefficients
 from zlocus.sensors.rpc_fit import RpcFit, fit_rpc
+from zlocus.synthetic.acquisitions import acquisition_of, write_tags
 from zlocus.synthetic.appearance import Changes, Moment, ground_in_view
 from zlocus.synthetic.cameras import RectifiedScanner
 from zlocus.synthetic.linescan import TrajectoryNoise, image_name, write_linescan_views, write_scene
@@ -30,6 +31,7 @@ from zlocus.synthetic.sensor_errors import WavySatelliteCamera
 from zlocus.synthetic.terrain import SyntheticGround
 from zlocus.synthetic.truth import write_truth
 from zlocus.synthetic.weather import weathered
+from zlocus.synthetic.works import with_works, write_works
 
 NOISE_STREAM = 9
 HEIGHT_MARGIN_M = 20.0
@@ -109,11 +111,16 @@ def _write_scene(spec: SceneSpec, folder: Path, progress: Callable[[str], None],
     progress("terrain")
     ground = build_ground(spec, exposures_of(steady(spec)))
     write_truth(spec, ground, exposures, folder)
+    if spec.works_day is not None:
+        write_truth(spec, with_works(ground, spec), exposures, folder, "_after")
+        write_works(ground, spec, folder / "works.geojson")
     described = {}
-    for exposure, numbers in render_exposures(spec, ground, exposures, progress):
+    for index, (exposure, numbers) in enumerate(render_exposures(spec, ground, exposures, progress)):
         view = exposure.view
         fit = fit_exposure(spec, exposure) if noise is None else None
         write_image(folder / image_name(view), numbers, None if fit is None else fit.rpc)
+        if spec.is_dated:
+            write_tags(folder / image_name(view), acquisition_of(spec, exposure, index))
         described[view.name] = {
             "along": view.along_deg, "across": view.across_deg, "heading": view.heading_deg,
             "bias_row_col": [view.bias_row_px, view.bias_col_px],
@@ -130,14 +137,15 @@ def render_exposures(
 ) -> Iterator[tuple[Exposure, NDArray[np.integer]]]:
     """Yield each exposure and its rendered image (r, c); images of rectified scanners are resampled to level 1."""
     lit: dict[Sun, NDArray[np.bool_]] = {}
+    later = ground if spec.works_day is None else with_works(ground, spec)
     for index, exposure in enumerate(exposures):
         view, taken = exposure.view, exposure.taken
         progress(view.name)
-        seen = ground
+        seen = ground if spec.works_day is None or view.day < spec.works_day else later
         if spec.changes != Changes() or spec.trouble is not None:
             moment = Moment(view.along_deg, view.across_deg, view.day, index)
-            seen = ground_in_view(ground, spec.changes, moment, spec.seed)
-        if view.sun not in lit or spec.changes.cars_per_km:
+            seen = ground_in_view(seen, spec.changes, moment, spec.seed)
+        if view.sun not in lit or spec.changes.cars_per_km or spec.works_day is not None:
             lit = {view.sun: sunlit(seen, view.sun)}
         radiance = render(seen, taken.sensor, taken.shape, view.sun, spec.samples, lit[view.sun])
         radiance = _through_weather(spec, exposure, seen, radiance)

@@ -125,6 +125,8 @@ class SceneSpec(Checked):
         None, "One trouble or lake painted into a town; unset: none.", choices=(*TROUBLES, *LAKES)
     )
     weather: tuple[Weather, ...] = ()
+    is_dated: bool = option(False, "The tags of the images say when and how they were taken.")
+    works_day: int | None = option(None, "Day from which on a pit and a heap are there; unset: never.", low=0)
     west_m: float = option(462000.0, "Western border of the area, easting.", unit="m")
     north_m: float = option(5247000.0, "Northern border of the area, northing.", unit="m")
     epsg: int = option(32632, "Projected CRS of the truth; heights are ellipsoidal.", low=1024, high=32767)

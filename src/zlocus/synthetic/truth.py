@@ -21,9 +21,11 @@ from zlocus.synthetic.terrain import WATER, SyntheticGround
 NODE_CELLS, NODE_HEIGHT_M = 32, 10.0
 
 
-def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Exposure], folder: Path) -> None:
+def write_truth(
+    spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Exposure], folder: Path, suffix: str = ""
+) -> None:
     """Write `truth_dsm.tif` and `truth_class.tif`, and with a painted trouble `trouble.tif`, at the step of the height
-    field.
+    field. suffix : at the end of the names.
 
     They cover the area of the scene, or with `spec.whole_truth` all ground that two or more of the exposures show; then
     heights are NaN where fewer do. Occlusion is ignored: an image shows every point that lies inside it. In realistic
@@ -48,8 +50,8 @@ def write_truth(spec: SceneSpec, ground: SyntheticGround, exposures: Sequence[Ex
         "crs": f"EPSG:{spec.epsg}", "transform": from_origin(west, north, spec.step_m, spec.step_m),
     }  # fmt: skip
     layers: tuple[tuple[str, NDArray[np.generic], str, float | None], ...] = (
-        ("truth_dsm.tif", heights, "height above the ellipsoid", np.nan if has_gaps else None),
-        ("truth_class.tif", classes, "class", None),
+        (f"truth_dsm{suffix}.tif", heights, "height above the ellipsoid", np.nan if has_gaps else None),
+        (f"truth_class{suffix}.tif", classes, "class", None),
     )
     if ground.marked is not None:
         layers += (("trouble.tif", ground.marked[cells].astype(np.uint8), "cells of the painted trouble", None),)
