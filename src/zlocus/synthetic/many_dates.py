@@ -32,6 +32,8 @@ MAX_ALONG_DEG, MAX_ACROSS_DEG, MAX_HEADING_DEG = 24.0, 20.0, 8.0
 LATITUDE_DEG, HOUR_ANGLE_DEG, TILT_DEG, EQUINOX, YEAR = 47.0, -18.0, 23.44, 81, 365.25
 CHANGES = Changes(directional=0.08, daily=0.15, cars_per_km=6.0)
 MAX_POINTING_PX, MAX_WAVE_PX, BLUR_PX = 0.8, 0.25, (0.7, 0.9)
+# Brightest surfaces are exposed just below the largest number of the sensor.
+GAIN, ROAD_ALBEDO = (2600.0, 3400.0), (0.45, 0.75)
 # Every so many days are hazy; the cloudy one is counted from the first.
 HAZY_EVERY, CLOUDY = 5, 3
 HAZE_SHARE, CLOUD_SHARE, MOISTURE = 0.25, 0.06, 0.06
@@ -59,7 +61,10 @@ def many_dates_spec(seed: int, n_images: int = N_IMAGES) -> SceneSpec:
         )
     return replace(
         realistic_spec(seed), size=SIZE_PX, margin_m=MARGIN_M, relief_m=RELIEF_M, objects=Objects(0.0, 0.0, 0.0, 0.0),
-        cover=Cover(houses_per_ha=5.0, forest_share=0.12, n_lakes=0, n_terraces=0, n_fields=1, rare_objects=()),
+        cover=Cover(
+            houses_per_ha=5.0, forest_share=0.12, n_lakes=0, n_terraces=0, n_fields=1, rare_objects=(),
+            road_albedo=ROAD_ALBEDO,
+        ),
         views=views, changes=CHANGES, weather=tuple(weather), is_dated=True, works_day=WORKS_DAY,
     )  # fmt: skip
 
@@ -67,7 +72,7 @@ def many_dates_spec(seed: int, n_images: int = N_IMAGES) -> SceneSpec:
 def _view(rng: np.random.Generator, day: int) -> ViewSpec:
     """The view of a day, named after it."""
     optics = Optics(
-        gain=rng.uniform(3800.0, 5200.0), haze=rng.uniform(120.0, 200.0), blur_px=rng.uniform(*BLUR_PX), noise=0.0,
+        gain=rng.uniform(*GAIN), haze=rng.uniform(120.0, 200.0), blur_px=rng.uniform(*BLUR_PX), noise=0.0,
         noise_floor=5.0,
     )  # fmt: skip
     errors = SensorErrors(column_gain=0.004, shot=0.05, quantum=rng.uniform(8.0, 14.0), saturation=4095)

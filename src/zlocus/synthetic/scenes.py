@@ -93,7 +93,7 @@ class SceneSpec(Checked):
     """A scene to render. Equal specifications give equal bytes.
 
     objects : of a town or of hills; cover : of a realistic scene (kind "real"). changes : what differs between its
-    images. weather : of each day, in order; later days are clear.
+    images. weather : of each day, in order; later days are clear. is_dated, works_day : see `acquisitions`, `works`.
     """
 
     kind: str = option("city", "Kind of objects on the ground.", choices=("city", "hills", "real"))
