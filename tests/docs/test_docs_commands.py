@@ -23,6 +23,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from docs_commands import (
+    IN_SMALL,
     INLINE,
     LAID_OUT,
     PAGES,
@@ -31,6 +32,7 @@ from docs_commands import (
     Step,
     all_commands,
     command_name,
+    in_small,
     inline_commands,
     name_of,
     steps_of,
@@ -40,6 +42,7 @@ from zlocus.cli.app import app
 from zlocus.cli.console import OutputOptions
 from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.synthetic.__main__ import _parser
+from zlocus.synthetic.__main__ import main as render
 
 COMMANDS = all_commands()
 # Per cent, of the figures in the tutorial.
@@ -141,6 +144,7 @@ def runnable(text: str) -> str:
     return re.sub(r"\s*\[-[^]]*\]", "", text).replace("INPUT...", INPUTS)
 
 
+RENDERING = ["python", "-m", "zlocus.synthetic"]
 # Signs by which a line asks more of the shell than words and `*`.
 SHELL = re.compile(r"[|&;<>$`\\~?\[{(]")
 
@@ -149,6 +153,8 @@ def is_run_here(step: Step, folder: Path) -> bool:
     """Whether a step is a command of zlocus that this process can run as one of its own would: imports and kernels are
     loaded already. `inspect` ends by a signal, and PROJ looks for a user's grids when a process starts."""
     words = [] if step.is_python else step.text.split()
+    if words[:3] == RENDERING:
+        return True
     if words[:1] != ["zlocus"] or words[1] == "inspect" or (folder / PROJ_GRIDS).exists():
         return False
     return SHELL.search(runnable(step.text)) is None
@@ -160,6 +166,9 @@ def run_here(words: list[str], folder: Path) -> None:
         sorted(name for name in glob(word, root_dir=folder)) or [word] if "*" in word else [word] for word in words
     ]
     with contextlib.chdir(folder):
+        if words[:3] == RENDERING:
+            assert render(words[3:]) == 0, " ".join(words)
+            return
         done = CliRunner().invoke(app, [name for names in found for name in names][1:], catch_exceptions=False)
     assert done.exit_code == 0, f"{' '.join(words)}\n{done.output}"
 
@@ -210,7 +219,7 @@ def test_the_commands_of_a_page_work(page, tmp_path):
             check_zlocus(step.text)
         # Without a layout a page's files are not there: its command line alone is checked.
         if lay_out:
-            run(step, tmp_path)
+            run(in_small(page, step), tmp_path)
     if name_of(page) in TOLD:
         TOLD[name_of(page)](tmp_path)
 
@@ -276,6 +285,13 @@ def test_a_page_without_a_layout_is_noticed(tmp_path):
     for name, text in texts.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     assert without_a_layout([tmp_path / name for name in texts]) == ["new.md", "python.md"]
+
+
+@pytest.mark.parametrize("name", IN_SMALL)
+def test_words_that_are_replaced_are_on_the_page(name):
+    texts = [step.text for step in steps_of(ROOT / name)]
+    for words in IN_SMALL[name]:
+        assert any(words in text for text in texts), words
 
 
 def test_every_layout_has_its_page():
