@@ -99,7 +99,7 @@ STAGES = re.findall(
 )
 FUNCTIONS = {name for name in zlocus.__all__ if name.islower() and not name.startswith("_")}
 # Folders in pages that are not those of the repository.
-NOT_OURS = {"cameras/", "images/", "point/", "scene/", "surface/", "sparse/"}
+NOT_OURS = {"cameras/", "drone/", "images/", "many/", "point/", "scene/", "surface/", "sparse/"}
 # Keys of run.json that begin like an option.
 IN_RUN_JSON = {"orientation.excluded_images", "orientation.doubts"}
 # Files that a reader of the page makes, or that stand for any.

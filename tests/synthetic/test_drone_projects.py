@@ -20,11 +20,11 @@ ON_THE_EARTH_PX = 4e-4 * 350
 
 
 def project_in(folder):
-    """A project whose frames show a gradient."""
+    """A project whose frames show noise."""
     block = drone_block_files(SPEC, folder)
     folder.mkdir()
     for path in block.images.values():
-        Image.linear_gradient("L").resize((SPEC.columns, SPEC.rows)).save(path)
+        Image.effect_noise((SPEC.columns, SPEC.rows), 40.0).save(path)
     block.scene.write_text("")
     return block
 

@@ -22,7 +22,7 @@ FOLDER, ORDER = "delivery", "500648062040_01"
 TILE_PX = 256
 
 
-def deliver(spec: SceneSpec, rendered: RenderedScene) -> Path:
+def deliver(spec: SceneSpec, rendered_scene: RenderedScene) -> Path:
     """Replace the images of a rendered scene by a folder with a product of each, and return that folder.
 
     Raises
@@ -30,14 +30,14 @@ def deliver(spec: SceneSpec, rendered: RenderedScene) -> Path:
     OutputError
         The folder exists already, or cannot be written.
     """
-    folder = rendered.folder / FOLDER
+    folder = rendered_scene.folder / FOLDER
     with new_folder(folder) as part:
         for index, exposure in enumerate(exposures_of(spec)):
-            with rasterio.open(rendered.images[exposure.view.name]) as image:
+            with rasterio.open(rendered_scene.images[exposure.view.name]) as image:
                 pixels = image.read(1)
             acquisition = acquisition_of(spec, exposure, index)
             _write_product(part, index + 1, pixels, fit_exposure(spec, exposure).rpc, acquisition)
-    for path in rendered.images.values():
+    for path in rendered_scene.images.values():
         path.unlink()
     return folder
 
