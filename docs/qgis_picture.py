@@ -1,7 +1,7 @@
 """Picture of a surface in QGIS: `/usr/bin/python3 docs/qgis_picture.py SURFACE [FOLDER]`, by a Python that has QGIS.
 
-SURFACE is the folder of the lesson `tutorials/delivery_to_contours.md`. Its layers are drawn as QGIS shows them when they
-are added to a project: each in the style of its name that lies beside it.
+SURFACE is the folder of the lesson `tutorials/delivery_to_contours.md`. Its layers are drawn as QGIS shows them when
+they are added to a project: each in the style of its name that lies beside it.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -14,7 +13,6 @@ import sys
 import tempfile
 from dataclasses import fields
 from functools import cache
-from glob import glob
 from pathlib import Path
 
 import httpx
@@ -38,18 +36,16 @@ from docs_commands import (
     steps_of,
 )
 from places import ROOT
+from typed_commands import is_run_here, run_here, runnable
 from zlocus.cli.app import app
 from zlocus.cli.console import OutputOptions
 from zlocus.io.styles.file_names import OF_SURFACE, style_files
 from zlocus.synthetic.__main__ import _parser
-from zlocus.synthetic.__main__ import main as render
 
 COMMANDS = all_commands()
 # Per cent, of the figures in the tutorial.
 TOLD_TO = 0.5
 ENDS_WITHIN_S = 10.0
-# What stands for the inputs of a run in lines that tell the usage.
-INPUTS = "img_1.tif img_2.tif img_3.tif"
 
 
 def options_of(text: str) -> set[str]:
@@ -137,40 +133,6 @@ ONLY_CHECKED = {
     "python benchmarks/": check_benchmark,  # minutes to hours on one core
     "python -m pytest benchmarks": check_pytest,  # times, which mean nothing beside other tests
 }
-
-
-def runnable(text: str) -> str:
-    """A line of usage as a command: without what is in brackets, and with three images for INPUT."""
-    return re.sub(r"\s*\[-[^]]*\]", "", text).replace("INPUT...", INPUTS)
-
-
-RENDERING = ["python", "-m", "zlocus.synthetic"]
-# Signs by which a line asks more of the shell than words and `*`.
-SHELL = re.compile(r"[|&;<>$`\\~?\[{(]")
-
-
-def is_run_here(step: Step, folder: Path) -> bool:
-    """Whether a step is a command of zlocus that this process can run as one of its own would: imports and kernels are
-    loaded already. `inspect` ends by a signal, and PROJ looks for a user's grids when a process starts."""
-    words = [] if step.is_python else step.text.split()
-    if words[:3] == RENDERING:
-        return True
-    if words[:1] != ["zlocus"] or words[1] == "inspect" or (folder / PROJ_GRIDS).exists():
-        return False
-    return SHELL.search(runnable(step.text)) is None
-
-
-def run_here(words: list[str], folder: Path) -> None:
-    """Runs a command of zlocus in this process, in a folder; `*` in its words stands for the files of the folder."""
-    found = [
-        sorted(name for name in glob(word, root_dir=folder)) or [word] if "*" in word else [word] for word in words
-    ]
-    with contextlib.chdir(folder):
-        if words[:3] == RENDERING:
-            assert render(words[3:]) == 0, " ".join(words)
-            return
-        done = CliRunner().invoke(app, [name for names in found for name in names][1:], catch_exceptions=False)
-    assert done.exit_code == 0, f"{' '.join(words)}\n{done.output}"
 
 
 def run(step: Step, folder: Path) -> None:
