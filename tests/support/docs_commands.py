@@ -39,8 +39,8 @@ from zlocus.synthetic.terrain import analytic_ground, analytic_height
 
 # Every page that a reader may be sent to, the notebooks aside.
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks" / "README.md"])
-# Those whose commands are run; the examples of the other have a test of their own.
-PAGES_WITH_COMMANDS = [page for page in PAGES if page.name != "contributing.md"]
+# Those whose commands are run; the examples of the others have tests of their own.
+PAGES_WITH_COMMANDS = [page for page in PAGES if page.name not in ("contributing.md", "paper_figures.md")]
 PROGRAMS = ("zlocus", "python", "make", "printf")
 BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```|((?:^ {4}[^\n]*\n)+)", re.DOTALL | re.MULTILINE)
 # Where a user's own grids of PROJ lie, below a page's folder.
@@ -351,7 +351,7 @@ IN_SMALL = {
     "docs/tutorials/many_dates.md": {"--size 240": "--size 120 --views 8", "img_20140[89]": "img_2014"},
     "docs/tutorials/drone_block.md": {
         "--resolution 0.4": "--resolution 1.2",
-        "--reference s1_2": "--reference s1_2 --bounds 462195 5247295 462205 5247305",
+        "--reference s2_2": "--reference s2_2 --bounds 462195 5247295 462205 5247305",
     },
 }
 
