@@ -23,10 +23,10 @@ PAGE = ROOT / "docs" / "tutorials" / "on_a_cluster.md"
 # The scene and its halves, smaller; tiles too, so that there are some.
 IN_SMALL = {
     "--size 1200": "--size 176",
+    "pyramid.tile=512": "pyramid.tile=96",
     "462000 5246400 462350 5247000": "462000 5246912 462050 5247000",
     "462250 5246400 462600 5247000": "462040 5246912 462088 5247000",
 }
-SMALL_TILES = " --set pyramid.tile=96"
 COMPILING = "python -m zlocus.pipeline.execution.precompile match\n"
 
 
@@ -42,7 +42,6 @@ def blocks_in_small() -> list[str]:
     for words, smaller in (IN_SMALL | {"8786": free_port(), COMPILING: ""}).items():
         assert words in text, words
         text = text.replace(words, smaller)
-    text = text.replace("--resolution 0.5", f"--resolution 0.5{SMALL_TILES}")
     return re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
