@@ -150,13 +150,13 @@ def write_bundler(folder):
     return Written(folder, project, ((1 - WIDE) / 2, (HIGH - 1) / 2), y_up=True)
 
 
-def write_eo(folder, heading=False, delimiter=" "):
+def write_eo(folder, heading=False, delimiter=" ", at=(0.0, 0.0, 0.0)):
     images(folder, ["a.tif", "b.tif", "c.tif"])
     lines = ["# an orientation"]
     if heading:
         lines.append(delimiter.join(["Omega", "Phi", "Kappa", "Label", "X", "Y", "Z"]))
     for i, name in enumerate("abc"):
-        pose, angles = [repr(float(v)) for v in CENTRES[i]], [repr(v) for v in ANGLES[i]]
+        pose, angles = [repr(float(v)) for v in CENTRES[i] + at], [repr(v) for v in ANGLES[i]]
         lines.append(delimiter.join([*angles, name, *pose] if heading else [name, *pose, *angles]))
     (folder / "eo.csv").write_text("\n".join(lines) + "\n")
     (folder / "camera.yaml").write_text(

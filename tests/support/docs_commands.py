@@ -218,7 +218,7 @@ def lay_out_cameras(folder: Path) -> None:
     metashape = camera_files.write_metashape(folder / "metashape").folder
     (metashape / "cameras.xml").rename(folder / "cameras.xml")
     shutil.move(metashape / "images" if (metashape / "images").is_dir() else metashape, folder / "photos")
-    table = camera_files.write_eo(folder / "eo").folder
+    table = camera_files.write_eo(folder / "eo", at=(500_000.0, 4_650_000.0, 0.0)).folder
     (table / "eo.csv").rename(folder / "orientations.csv")
     for image in table.glob("*.tif"):
         image.rename(folder / image.name)
