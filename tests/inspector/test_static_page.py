@@ -283,7 +283,10 @@ def test_the_slider_moves_all_that_shows_a_height(page, inspected, out):
     at = float(page.locator(line).get_attribute("x1"))
     circles = "nodes => nodes.map((node) => node.getAttribute('transform'))"
     places = page.eval_on_selector_all("#loci-figure circle.selected-height", circles)
+    shown = page.locator("#height-value").inner_text()
     page.locator("#height").fill(str(middle + 9))
+    # All is drawn again with the next frame.
+    page.wait_for_function("text => document.getElementById('height-value').textContent !== text", arg=shown)
     height = report.heights_m[middle + 9]
     assert number(page.locator("#height-value").inner_text()) == pytest.approx(height, abs=SHOWN_M)
     assert page.eval_on_selector_all(fixed, pictures) == before
