@@ -206,6 +206,8 @@ def test_a_client_that_found_nobody_is_collected_at_once(tmp_path):
 
 def test_a_signal_as_a_call_begins(tmp_path, caplog):
     """Results are waited for where no signal interrupts `distributed`, which would print a traceback."""
+    # Python's own handler, whatever was run in this process before.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with cluster(tmp_path, n_workers=1) as found, Cluster(Planted(tmp_path), found.address) as workers:
         workers.submit(1)
         loop = workers._client.loop
