@@ -12,7 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,20 +53,20 @@ def rendered_scene(folder: Path) -> Path:
     return folder
 
 
-def run_here(command: Sequence[str]) -> None:
+def run_here(command: Sequence[str], accept: Collection[int | None] = (None, 0)) -> None:
     """Run a command of zlocus in this process, where a benchmark can observe it; its output goes to standard error.
 
-    command : the words after `zlocus` on the command line.
+    command : the words after `zlocus` on the command line; accept : exit statuses that are no failure.
 
     Raises
     ------
     CannotRun
-        The exit status of the command is not 0.
+        The command ends with another exit status.
     """
     with redirect_stdout(sys.stderr):
         # In this mode the command line returns the status of a failure instead of ending the process.
         status = cli(list(command), standalone_mode=False)
-    if status:
+    if status not in accept:
         raise CannotRun(f"`zlocus {command[0]}` ends with status {status}: its message stands above.")
 
 

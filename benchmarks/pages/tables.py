@@ -300,6 +300,31 @@ def of_choice(values: Mapping[str, float]) -> str:
     return ", ".join([f"{values['error']:.3g}{spread}", *within, f"{values['CPU']:.0f} s"])
 
 
+@table("departures")
+def departures(results: AllResults) -> str:
+    """What the surface loses where a departure from the papers is taken back: a line for each, columns of scenes."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for figure in of_row(results, "departures").figures:
+        place, _, quantity = figure.what.rpartition(": ")
+        scene, separator, departure = place.rpartition(", without ")
+        if separator:
+            found.setdefault(departure, {}).setdefault(scene, {})[quantity] = figure.value
+    scenes = list(dict.fromkeys(scene for of_departure in found.values() for scene in of_departure))
+    lines = [
+        [name, *(what_is_lost(of_departure[scene]) if scene in of_departure else "" for scene in scenes)]
+        for name, of_departure in found.items()
+    ]
+    return markdown(["taken back", *(f"{scene}: lost within 1 m; RMSE added" for scene in scenes)], lines)
+
+
+def what_is_lost(values: Mapping[str, float]) -> str:
+    """What is lost on some scenes: share within 1 m, with its standard error and the number of scenes, and RMSE."""
+    several = "standard error of what is lost" in values
+    error = f" ± {values['standard error of what is lost']:.4f}" if several else ""
+    number = f", on {values['scenes that lose']:.0f} scenes" if several else ""
+    return f"{values['lost within 1 m']:.4f}{error}{number}; {values['RMSE added']:+.2f} m"
+
+
 @table("kernels")
 def kernels(results: AllResults) -> str:
     """Time of a unit of work of every benchmark of a kernel."""

@@ -54,6 +54,7 @@ ROWS: dict[str, Row] = {
     "redo": Row("rows.redo:redo", WITH_RENDERER),
     "precision": Row("rows.standard_deviations:precision", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     "flags": Row("rows.flags:flags", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
+    "departures": Row("rows.departures:departures", (*WITH_RENDERER, "benchmarks/precision.py"), is_slow=True),
     # How hard the recipe is for other programs: from benchmarks/peers/results.json.
     "hardness": Row("rows.realistic:hardness", is_recorded=False),
     "calanques": Row("rows.satellite:calanques"),

@@ -23,6 +23,7 @@ RUN_BY = {
     "conftest.py": "test_speed.py::test_the_benchmarks_of_the_kernels",
     "cloud_files.py": "test_speed.py::test_files_of_points_are_compared",
     "coregistration.py": "test_acceptance.py::test_planted_shifts_are_found",
+    "rows/departures.py": "test_departures_row.py::test_a_function_is_replaced_while_the_surface_is_made",
     "displaced_windows.py": "test_ortho_images_row.py::test_a_displaced_ortho_image_is_judged",
     "double_mapping.py": "test_surfaces.py::test_cells_that_show_what_hides_them",
     "frame_block.py": "test_frame_block.py::test_a_block_is_planned_and_a_part_of_it_matched",
