@@ -62,6 +62,11 @@ class Loopback:
         more = ["--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0"]
         self.workers.append(self._started("worker", self.address, *more))
 
+    def wait_for_workers(self) -> None:
+        """Return when every worker can be given tasks: on a busy machine one would work before the other has started."""
+        with distributed.Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(len(self.workers), timeout=60)
+
     def _started(self, kind: str, *arguments: str) -> subprocess.Popen[bytes]:
         words = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *arguments]
         return subprocess.Popen(words, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -79,6 +84,7 @@ def cluster(folder, n_workers=2):
     try:
         for _ in range(n_workers):
             found.add_worker()
+        found.wait_for_workers()
         yield found
     finally:
         found.stop()
