@@ -44,6 +44,7 @@ from zlocus.matching.kernels.winners import winner_takes_all, winners
 from zlocus.matching.local_planes import mean_of_planes
 from zlocus.matching.prior_costs import CANDIDATE_REACH, COST_OF_CANDIDATES
 from zlocus.matching.subpixel import smoothed
+from zlocus.matching.uncertain_heights import with_medians
 from zlocus.products.hillshade import hillshade
 
 SIDE, BLOCK, ROUNDS = 320, 32, 5
@@ -281,6 +282,15 @@ def local_planes_case(side: int = SIDE) -> Case:
     )  # fmt: skip
 
 
+def weighted_median_case(side: int = SIDE) -> Case:
+    """Weighted medians around the cells of a noisy surface, a third of which are uncertain."""
+    rng = np.random.default_rng(6)
+    height = rolling(side) + rng.normal(0, 2.0, (side, side)).astype(np.float32)
+    sigma = np.where(rng.random(height.shape) < 1 / 3, 6.0, 0.5).astype(np.float32)
+    grey, is_known = rng.normal(0, 1, height.shape).astype(np.float32), np.ones(height.shape, np.bool_)
+    return Case(lambda: with_medians(height, sigma, grey, is_known, 2.0, 1.0), height.size, "cell")
+
+
 def visibility_case(by_col: float = 0.4, by_row: float = 0.2, side: int = SIDE) -> Case:
     """Occlusion of a surface in one view; by_col, by_row : parallax rate, which decides the direction of the sweep."""
     surface = rolling(side)
@@ -428,6 +438,10 @@ def test_smooth(benchmark, side):
 
 def test_local_planes(benchmark, side):
     timed(benchmark, local_planes_case(side or SIDE))
+
+
+def test_weighted_medians(benchmark, side):
+    timed(benchmark, weighted_median_case(side or SIDE))
 
 
 def test_visibility(benchmark, side):

@@ -325,6 +325,36 @@ def what_is_lost(values: Mapping[str, float]) -> str:
     return f"{values['lost within 1 m']:.4f}{error}{number}; {values['RMSE added']:+.2f} m"
 
 
+# As published for JAX_068: mean absolute error, RMSE and median (m), share within 1 m, machine and time, protocol.
+PUBLISHED_ON_JACKSONVILLE = {
+    "S2P": ("2.09", "4.60", "", "", "CPU", "pairs of images"),
+    "Sat-NeRF": ("1.27", "2.38", "0.66", "0.65", "GPU, dozens of hours", "the script of EOGS++"),
+    "EO-NeRF": ("1.16", "2.20", "", "", "GPU, about a day", "other masks"),
+    "EOGS": ("1.08", "2.32", "0.49", "0.75", "GPU, a few minutes", "the script of EOGS++, six seeds"),
+    "EOGS++": ("0.99", "2.13", "0.40", "0.76", "GPU (RTX 3090), minutes", "the script of EOGS++, six seeds"),
+    "HLC-GS": ("0.74", "1.91", "", "", "GPU, not given", "other masks"),
+}
+
+
+@table("neural-methods")
+def neural_methods(results: AllResults) -> str:
+    """Published figures of neural methods on nineteen WorldView-3 images of Jacksonville, and those of zlocus."""
+    it = of_row(results, "many-images")
+    parts = [(*figure.what.partition(": "), figure.value) for figure in it.figures]
+    ours = {quantity: value for stack, _, quantity, value in parts if stack == "nineteen"}
+    errors = ("mean absolute error", "RMSE", "median", "within 1 m")
+    where = f"{ours['CPU']:.0f} s of CPU on {it.machine['processor']}, no GPU"
+    line = [
+        "**zlocus**",
+        *(f"{ours[quantity]:.2f}" for quantity in errors),
+        where,
+        "half of the laser cells",
+    ]
+    lines = [[name, *values] for name, values in PUBLISHED_ON_JACKSONVILLE.items()]
+    head = ["method", "MAE, m", "RMSE, m", "median, m", "within 1 m", "machine and time", "protocol"]
+    return markdown(head, [*lines, line])
+
+
 @table("kernels")
 def kernels(results: AllResults) -> str:
     """Time of a unit of work of every benchmark of a kernel."""

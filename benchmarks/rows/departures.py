@@ -54,6 +54,7 @@ DEPARTURES = {
     "cheap jumps at edges": Departure({"semiglobal": {"p2_edge": 400}}),
     "planes through plain segments": Departure({"planes": {"texture": 0.0}}),
     "smoothing by planes": Departure({"refine": {"max_plane_side": 0}}),
+    "medians of uncertain heights": Departure({"refine": {"median_sigma_steps": 1e6}}),
 }  # fmt: skip
 
 

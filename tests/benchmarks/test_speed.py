@@ -293,7 +293,8 @@ def test_the_benchmarks_of_the_kernels(tmp_path, monkeypatch):
     assert names == {
         "test_resample", "test_costs", "test_costs_of_evidence", "test_costs_of_candidates",
         "test_sgm", "test_mgm", "test_winners", "test_least_costs", "test_profile",
-        "test_smooth", "test_local_planes", "test_visibility", "test_free_rays", "test_ray_costs", "test_agreement",
+        "test_smooth", "test_local_planes", "test_weighted_medians",
+        "test_visibility", "test_free_rays", "test_ray_costs", "test_agreement",
         "test_shade", "test_reach", "test_spline", "test_ortho",
         "test_image_from_ground", "test_ground_from_image", "test_to_the_earth",
         "test_rpc_image_from_ground", "test_rpc_ground_from_image", "test_nearest_descriptors",

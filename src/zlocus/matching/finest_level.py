@@ -13,7 +13,7 @@ from zlocus.core.options.option_fields import value_of
 from zlocus.matching.height_checks import judge
 from zlocus.matching.kernels.spline import spline_coefficients
 from zlocus.matching.level_records import LevelResult, TileInputs
-from zlocus.matching.local_contrast import agreeing_views, texture_unit
+from zlocus.matching.local_contrast import agreeing_views, edge_image, texture_unit
 from zlocus.matching.local_planes import SIDES, smoothed_by_planes
 from zlocus.matching.occlusion import covers, excluded_view_mask, n_seeing
 from zlocus.matching.overlap import OverlapGround, unsupported
@@ -23,6 +23,7 @@ from zlocus.matching.quality import Quality, is_empty
 from zlocus.matching.subpixel import refine
 from zlocus.matching.surface import Surface
 from zlocus.matching.true_ortho import CoarserHeights, ortho_image, surroundings_of_tile, true_ortho
+from zlocus.matching.uncertain_heights import with_medians
 
 # Number of views in which segments without texture are looked for, one after the other.
 MAX_VIEWS_FOR_PLANES = 2
@@ -96,7 +97,11 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     if tile.method != "mvll":
         sides = [side for side in SIDES if side <= value_of(config.refine, "max_plane_side")]
         # The standard deviations stay: in some scenes the errors reach farther than the planes.
-        lattice_index = smoothed_by_planes(lattice_index, sigma, ~is_empty(quality), result.level.core, sides).height
+        is_known = ~is_empty(quality)
+        lattice_index = smoothed_by_planes(lattice_index, sigma, is_known, result.level.core, sides).height
+        grey = _grey_of_ground(result, lattice_index, is_covered)
+        unit, min_sigma = texture_unit(grey, result.level.core), config.refine.median_sigma_steps
+        lattice_index = with_medians(lattice_index, sigma, grey, is_known, min_sigma, unit)
     height = result.lattice.metres(lattice_index)
     sigma *= np.float32(match_scene.height_step)
     height[is_empty(quality)] = np.nan
@@ -104,6 +109,14 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     n_images = np.where(np.isnan(height), 0, n_views).astype(np.uint8)
     surface = Surface(height, sigma, quality, n_images, np.full_like(height, np.nan))
     return RefinedSurface(surface, lattice_index)
+
+
+def _grey_of_ground(
+    result: LevelResult, lattice_index: NDArray[np.float32], is_covered: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """An ortho-image (r, c) of the heights, of a view that agrees with the others; NaN where it shows nothing."""
+    agrees = np.ones(len(is_covered)) if result.agreement is None else result.agreement
+    return edge_image(result.tile_views, lattice_index, is_covered, result.level.core, agrees)
 
 
 def _mark_overlap(

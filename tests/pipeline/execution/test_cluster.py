@@ -63,7 +63,7 @@ class Loopback:
         self.workers.append(self._started("worker", self.address, *more))
 
     def wait_for_workers(self) -> None:
-        """Return when every worker can be given tasks: on a busy machine one would work before the other has started."""
+        """Return when every worker can be given tasks. On a busy machine one would do all before another starts."""
         with distributed.Client(self.address, set_as_default=False) as client:
             client.wait_for_workers(len(self.workers), timeout=60)
 
@@ -212,18 +212,21 @@ def test_a_client_that_found_nobody_is_collected_at_once(tmp_path):
 
 def test_a_signal_as_a_call_begins(tmp_path, caplog):
     """Results are waited for where no signal interrupts `distributed`, which would print a traceback."""
-    # Python's own handler, whatever was run in this process before.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with cluster(tmp_path, n_workers=1) as found, Cluster(Planted(tmp_path), found.address) as workers:
-        workers.submit(1)
-        loop = workers._client.loop
-        loop.add_callback(time.sleep, BUSY_S)  # so that the next call waits for its turn
-        threading.Timer(BUSY_S / 4, os.kill, (os.getpid(), signal.SIGINT)).start()
-        with pytest.raises(KeyboardInterrupt):
-            workers.wait()
-        handled = threading.Event()
-        loop.add_callback(handled.set)
-        assert handled.wait(60)
+    # A process that a shell starts in the background ignores this signal.
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with cluster(tmp_path, n_workers=1) as found, Cluster(Planted(tmp_path), found.address) as workers:
+            workers.submit(1)
+            loop = workers._client.loop
+            loop.add_callback(time.sleep, BUSY_S)  # so that the next call waits for its turn
+            threading.Timer(BUSY_S / 4, os.kill, (os.getpid(), signal.SIGINT)).start()
+            with pytest.raises(KeyboardInterrupt):
+                workers.wait()
+            handled = threading.Event()
+            loop.add_callback(handled.set)
+            assert handled.wait(60)
+    finally:
+        signal.signal(signal.SIGINT, inherited)
     assert not caplog.records
 
 

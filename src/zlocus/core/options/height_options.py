@@ -31,6 +31,11 @@ class RefineOptions(Checked):
         "precision. 0: no smoothing.",
         choices=(0, 5, 9, 17, 33), unit="cells",
     )  # fmt: skip
+    median_sigma_steps: float = option(
+        2.0, "Standard deviation above which a height is replaced by the weighted median of those around it. "
+        "1e6: never.",
+        low=0.0, high=1e6, unit="steps",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
