@@ -14,6 +14,7 @@ from zlocus.orientation.kernels.descriptors import (
     SecondFeatures,
     nearest_descriptors,
 )
+from zlocus.sensors.distortion import BrownDistortion
 from zlocus.sensors.rpc import RpcModel
 
 # Features of two images of 0.6 Mpx, in a sample and all of them, and the points of a pair of images.
@@ -38,6 +39,13 @@ def test_rpc_image_from_ground(benchmark, points):
     model, xy, z = points
     xyz = model.ground_from_image(xy, z)
     timed(benchmark, Case(lambda: model.image_from_ground(xyz), len(xyz), "point"))
+
+
+def test_ideal_positions(benchmark):
+    """Positions of a lens whose distortion is removed."""
+    lens = BrownDistortion(k1=-0.26, k2=0.10, p1=7e-4, p2=3e-4, k3=-0.025)
+    at = np.random.default_rng(SEED).uniform(-0.4, 0.4, (N_POINTS, 2))
+    timed(benchmark, Case(lambda: lens.undistorted(at), len(at), "point"))
 
 
 def descriptors(rng, n):

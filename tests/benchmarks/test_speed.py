@@ -297,7 +297,7 @@ def test_the_benchmarks_of_the_kernels(tmp_path, monkeypatch):
         "test_visibility", "test_free_rays", "test_ray_costs", "test_agreement",
         "test_shade", "test_reach", "test_spline", "test_ortho",
         "test_image_from_ground", "test_ground_from_image", "test_to_the_earth",
-        "test_rpc_image_from_ground", "test_rpc_ground_from_image", "test_nearest_descriptors",
+        "test_rpc_image_from_ground", "test_rpc_ground_from_image", "test_ideal_positions", "test_nearest_descriptors",
     }  # fmt: skip
     for benchmark in report["benchmarks"]:
         (ns,) = (value for name, value in benchmark["extra_info"].items() if name.startswith("ns per"))

@@ -47,5 +47,21 @@ def test_images_of_rays_are_those_of_plain_numpy(lens):
     assert np.isfinite(found[~behind]).all() == (lens is None)
 
 
+def test_ideal_positions_are_those_of_plain_bisection():
+    """Without a tangential part a position moves along its radius, and the radius is that of a root of one equation."""
+    lens, radial = replace(RATIONAL, p1=0.0, p2=0.0), np.linspace(0.0, 0.7, 200)
+    low, high = np.zeros_like(radial), np.full_like(radial, lens._disc.radius)
+    for _ in range(100):
+        middle = (low + high) / 2
+        is_below = middle * lens._radial(middle**2)[0] < radial
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
+    direction = np.array([0.6, -0.8])
+    found = lens.undistorted(radial[:, None] * direction)
+    np.testing.assert_allclose(found, low[:, None] * direction, rtol=1e-12, atol=1e-12)
+    # Positions do not depend on those beside them.
+    one_by_one = np.vstack([lens.undistorted(at[None]) for at in radial[:, None] * direction])
+    np.testing.assert_array_equal(found, one_by_one)
+
+
 def test_a_point_without_coordinates_has_no_image():
     assert np.isnan(camera(LENS).image_from_ray(np.array([[np.nan, 0.0, -50.0]]))).all()

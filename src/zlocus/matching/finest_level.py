@@ -33,6 +33,20 @@ MAX_TEXTURE_RATIO_OF_SHARP_VIEW = 1.5
 
 
 @dataclass(frozen=True)
+class MeasuredHeights:
+    """Refined heights of single cells, (r, c) each.
+
+    lattice_index : float32; sigma : float32, their standard deviations, steps; quality : uint16; n_views : views that
+    see a cell.
+    """
+
+    lattice_index: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    quality: NDArray[np.uint16]
+    n_views: NDArray[np.integer]
+
+
+@dataclass(frozen=True)
 class RefinedSurface:
     """surface : of the finest level's window, without ortho-image; lattice_index : (r, c) float32, heights of all
     cells, of those too that the surface leaves empty."""
@@ -72,6 +86,21 @@ def _known_ortho(result: LevelResult, lattice_index: NDArray[np.float32], view: 
 
 def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:
     """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
+    measured = _measured_heights(tile, result, ground)
+    lattice_index, quality = measured.lattice_index, measured.quality
+    if tile.method != "mvll":
+        lattice_index = _smoothed(tile, result, measured)
+    height = result.lattice.metres(lattice_index)
+    sigma = measured.sigma * np.float32(tile.match_scene.height_step)
+    height[is_empty(quality)] = np.nan
+    sigma[is_empty(quality)] = np.nan
+    n_images = np.where(np.isnan(height), 0, measured.n_views).astype(np.uint8)
+    surface = Surface(height, sigma, quality, n_images, np.full_like(height, np.nan))
+    return RefinedSurface(surface, lattice_index)
+
+
+def _measured_heights(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> MeasuredHeights:
+    """Refine the heights of single cells, check them, and estimate their precision."""
     match_scene, config = tile.match_scene, tile.config
     splines, layout = np.empty_like(result.tile_views.pixels), result.tile_views.layout
     for view, (first, rows, cols) in zip(result.tile_views.view_pixels, layout, strict=True):
@@ -93,30 +122,23 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     is_uneven = spread_around(sigma) > config.checks.max_overlap_edge_sigma_steps
     is_noise = ground.is_at_edge_in(result.level.window) & is_uneven
     quality[is_noise] |= np.uint16(Quality.NO_MATCH)
-    lattice_index = refined.height
-    if tile.method != "mvll":
-        sides = [side for side in SIDES if side <= value_of(config.refine, "max_plane_side")]
-        # The standard deviations stay: in some scenes the errors reach farther than the planes.
-        is_known = ~is_empty(quality)
-        lattice_index = smoothed_by_planes(lattice_index, sigma, is_known, result.level.core, sides).height
-        grey = _grey_of_ground(result, lattice_index, is_covered)
-        unit, min_sigma = texture_unit(grey, result.level.core), config.refine.median_sigma_steps
-        lattice_index = with_medians(lattice_index, sigma, grey, is_known, min_sigma, unit)
-    height = result.lattice.metres(lattice_index)
-    sigma *= np.float32(match_scene.height_step)
-    height[is_empty(quality)] = np.nan
-    sigma[is_empty(quality)] = np.nan
-    n_images = np.where(np.isnan(height), 0, n_views).astype(np.uint8)
-    surface = Surface(height, sigma, quality, n_images, np.full_like(height, np.nan))
-    return RefinedSurface(surface, lattice_index)
+    return MeasuredHeights(refined.height, sigma, quality, n_views)
 
 
-def _grey_of_ground(
-    result: LevelResult, lattice_index: NDArray[np.float32], is_covered: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """An ortho-image (r, c) of the heights, of a view that agrees with the others; NaN where it shows nothing."""
+def _smoothed(tile: TileInputs, result: LevelResult, measured: MeasuredHeights) -> NDArray[np.float32]:
+    """Heights (r, c) smoothed by local planes, and medians of those that stay uncertain.
+
+    The standard deviations stay: in some scenes the errors reach farther than the planes.
+    """
+    options, core, is_known = tile.config.refine, result.level.core, ~is_empty(measured.quality)
+    sides = [side for side in SIDES if side <= value_of(options, "max_plane_side")]
+    smooth = smoothed_by_planes(measured.lattice_index, measured.sigma, is_known, core, sides).height
+    is_covered = covers(result.visible)
     agrees = np.ones(len(is_covered)) if result.agreement is None else result.agreement
-    return edge_image(result.tile_views, lattice_index, is_covered, result.level.core, agrees)
+    grey = edge_image(result.tile_views, smooth, is_covered, core, agrees)
+    return with_medians(
+        smooth, measured.sigma, grey, is_known, options.median_sigma_steps, texture_unit(grey, core)
+    )  # fmt: skip
 
 
 def _mark_overlap(

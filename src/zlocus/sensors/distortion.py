@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.sensors.frame_kernel import LensNumbers
+from zlocus.sensors.frame_kernel import CONVERGED_STEP, MAX_ERROR, MAX_ITERATIONS, LensNumbers, ideal_positions
 
 # Largest angle from the optical axis.
 MAX_ANGLE_FROM_AXIS_DEG = 89.5
@@ -21,10 +21,6 @@ MAX_ANGLE_FROM_AXIS_DEG = 89.5
 MIN_SLOPE = 0.01
 # Radii or angles at which the disc is tabulated.
 N_NODES = 4096
-MAX_ITERATIONS = 50
-# Relative size of the last Newton step, and largest remaining error of a position that counts as found.
-CONVERGED_STEP = 1e-14
-MAX_ERROR = 1e-11
 
 
 class Distortion(Protocol):
@@ -96,22 +92,12 @@ class BrownDistortion:
     def undistorted(self, at: FloatArray) -> FloatArray:
         """See `Distortion`: Newton from the inverse of the radial part, kept in the disc."""
         at = np.asarray(at, float)
-        rim = self._disc.radius
         far = np.hypot(at[:, 0], at[:, 1])
         # Positions that no camera has would overflow; they are beyond the disc in any case.
         at = np.where((far < 1e9)[:, None], at, np.nan)
         guess = self._disc.inverse(far)
         ideal = at * np.divide(guess, far, out=np.ones_like(far), where=far > 0)[:, None]
-        for _ in range(MAX_ITERATIONS):
-            step = self._newton_step(ideal, at)
-            ideal = ideal + step
-            radius = np.hypot(ideal[:, 0], ideal[:, 1])
-            ideal *= np.minimum(1.0, rim / np.maximum(radius, 1e-300))[:, None]
-            if not (np.abs(step) > CONVERGED_STEP * (1.0 + radius[:, None])).any():
-                break
-        r2 = (ideal**2).sum(axis=1)
-        gap = np.abs(self._mapped(ideal, r2, self._radial(r2)[0]) - at)
-        ideal[~(gap <= MAX_ERROR * (1.0 + far[:, None])).all(axis=1)] = np.nan
+        ideal_positions(at, self.numbers, ideal)
         return ideal
 
     @cached_property
@@ -148,17 +134,6 @@ class BrownDistortion:
             out[:, 0] += 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
             out[:, 1] += self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
         return out
-
-    def _newton_step(self, ideal: FloatArray, target: FloatArray) -> FloatArray:
-        """Newton step (n, 2) towards the ideal positions that are mapped to `target`."""
-        (x, y), r2 = ideal.T, (ideal**2).sum(axis=1)
-        factor, slope = self._radial(r2)
-        dx, dy = (target - self._mapped(ideal, r2, factor)).T
-        xx = factor + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
-        yy = factor + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
-        xy = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
-        determinant = xx * yy - xy * xy
-        return np.column_stack([(yy * dx - xy * dy) / determinant, (xx * dy - xy * dx) / determinant])
 
 
 @dataclass(frozen=True)

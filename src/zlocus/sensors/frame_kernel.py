@@ -1,4 +1,4 @@
-"""The image of a frame camera, ray by ray.
+"""The image of a frame camera, ray by ray, and the way back through its lens.
 
 Projection tables of close cameras take hundreds of millions of rays. In plain NumPy each takes ten times as long.
 """
@@ -11,6 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.jit import kernel
+
+MAX_ITERATIONS = 50
+# Relative size of the last Newton step, and largest remaining error of a position that counts as found.
+CONVERGED_STEP = 1e-14
+MAX_ERROR = 1e-11
+MIN_RADIUS = 1e-300
 
 
 class CameraNumbers(NamedTuple):
@@ -61,3 +67,46 @@ def image_of_rays(rays, camera, lens, out):
         real_y = y * factor + lens.p1 * (r2 + 2.0 * y * y) + 2.0 * lens.p2 * x * y
         out[n, 0] = real_x * camera.focal + camera.skew * real_y + camera.column
         out[n, 1] = real_y * camera.focal * camera.aspect + camera.row
+
+
+# f8, LensNumbers -> f8, f8
+@kernel
+def radial_factor(r2, lens):
+    """By how much the lens moves a position outwards, and the derivative of that by its squared radius."""
+    above = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    below = 1.0 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6))
+    above_slope = lens.k1 + r2 * (2.0 * lens.k2 + r2 * 3.0 * lens.k3)
+    below_slope = lens.k4 + r2 * (2.0 * lens.k5 + r2 * 3.0 * lens.k6)
+    return above / below, (above_slope * below - above * below_slope) / (below * below)
+
+
+# (n,2) f8, LensNumbers, (n,2) f8 -> None
+@kernel
+def ideal_positions(real, lens, ideal):
+    """Write the ideal position of each real one, NaN where no position of the disc is mapped.
+
+    ideal : first guesses, inside of the disc. Newton's method, whose positions are kept in the disc.
+    """
+    rim, p1, p2 = np.sqrt(lens.radius_squared), lens.p1, lens.p2
+    for n in range(real.shape[0]):
+        x, y, is_last = ideal[n, 0], ideal[n, 1], False
+        for _ in range(MAX_ITERATIONS + 1):
+            r2 = x * x + y * y
+            factor, slope = radial_factor(r2, lens)
+            dx = real[n, 0] - (x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
+            dy = real[n, 1] - (y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
+            if is_last:
+                break
+            xx = factor + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+            yy = factor + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+            xy = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+            determinant = xx * yy - xy * xy
+            by_x, by_y = (yy * dx - xy * dy) / determinant, (xx * dy - xy * dx) / determinant
+            x, y = x + by_x, y + by_y
+            radius = np.hypot(x, y)
+            kept = min(1.0, rim / max(radius, MIN_RADIUS))
+            x, y, largest = x * kept, y * kept, CONVERGED_STEP * (1.0 + radius)
+            is_last = not (abs(by_x) > largest or abs(by_y) > largest)
+        largest = MAX_ERROR * (1.0 + np.hypot(real[n, 0], real[n, 1]))
+        is_found = abs(dx) <= largest and abs(dy) <= largest
+        ideal[n, 0], ideal[n, 1] = (x, y) if is_found else (np.nan, np.nan)
