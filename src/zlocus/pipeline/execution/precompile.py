@@ -132,6 +132,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     from zlocus.orientation.tie_refinement import refine_ties
     from zlocus.orientation.ties import MAX_DESCRIPTOR_RATIO, match_along_curves
     from zlocus.orientation.triangulate import Observations, ground_jacobian
+    from zlocus.sensors.distortion import BrownDistortion
     from zlocus.sensors.frame import FrameModel
     from zlocus.sensors.rpc_kernel import ground_positions, positions
 
@@ -149,6 +150,7 @@ def warm_orientation(match_scene: MatchScene) -> None:
     ground_positions(coefficients, np.ones((2, 10, 4)), found, one, np.ones(2), found)
     above = FrameModel((0.0, 0.0, 10.0), ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)), 10.0, (4.0, 4.0))
     above.image_from_ray(np.zeros((1, 3)))
+    BrownDistortion().undistorted(xy)
 
 
 def warm_costs_of_heights() -> None:
