@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from typing import Any, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 from processing.core.ProcessingConfig import ProcessingConfig
 from qgis.core import (
@@ -173,11 +173,9 @@ class ZlocusAlgorithm(QgsProcessingAlgorithm):
         WrongValue
             The layer is not of a file.
         """
-        if is_empty(parameters.get(name)):
-            return ""
-        layer = self.parameterAsRasterLayer(parameters, name, context)
+        layer = self._layer(parameters, name, "raster", lambda: self.parameterAsRasterLayer(parameters, name, context))
         if layer is None:
-            raise WrongValue(f"{parameters[name]} cannot be opened as a raster. Check the path.")
+            return ""
         if layer.providerType() != "gdal" or not os.path.isfile(layer.source()):
             raise WrongValue(f"The layer {layer.name()} is not of a raster file. Save it as a GeoTIFF first.")
         return str(layer.source())
@@ -190,12 +188,25 @@ class ZlocusAlgorithm(QgsProcessingAlgorithm):
         WrongValue
             The layer cannot be opened or written.
         """
+        layer = self._layer(
+            parameters, name, "vector layer", lambda: self.parameterAsVectorLayer(parameters, name, context)
+        )
+        return "" if layer is None else file_of(layer, context)
+
+    def _layer(self, parameters: dict[str, Any], name: str, kind: str, opened: Callable[[], Any]) -> Any:
+        """A layer; None where none is given. opened : the layer as QGIS opens it, None where it cannot.
+
+        Raises
+        ------
+        WrongValue
+            The layer cannot be opened.
+        """
         if is_empty(parameters.get(name)):
-            return ""
-        layer = self.parameterAsVectorLayer(parameters, name, context)
+            return None
+        layer = opened()
         if layer is None:
-            raise WrongValue(f"{parameters[name]} cannot be opened as a vector layer. Check the path.")
-        return file_of(layer, context)
+            raise WrongValue(f"{parameters[name]} cannot be opened as a {kind}. Check the path.")
+        return layer
 
 
 def is_empty(value: Any) -> bool:

@@ -10,11 +10,11 @@ import rasterio
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning
 
-from rpc_fixtures import gdal_rpc, satellite_rpc
+from rpc_fixtures import satellite_rpc
 from zlocus.core.errors import InputError
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.products import rpc_copies
-from zlocus.products.rpc_copies import write_rpc_copy
+from zlocus.products.rpc_copies import gdal_rpc, write_rpc_copy
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 SHAPE = (700, 530)

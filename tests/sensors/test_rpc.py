@@ -11,9 +11,10 @@ from pyproj import CRS
 from rasterio.transform import RPCTransformer
 
 from reference import rpc as plain
-from rpc_fixtures import gdal_rpc, satellite_rpc
+from rpc_fixtures import satellite_rpc
 from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.rpc import read_rpc
+from zlocus.products.rpc_copies import gdal_rpc
 from zlocus.sensors.rpc import TOLERANCE_PX, RpcModel, rpc_terms
 from zlocus.sensors.rpc_kernel import ground_positions, positions
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from rasterio.errors import NotGeoreferencedWarning
 
 from mask_files import box, gml
-from rpc_fixtures import dimap_rpc, gdal_rpc, rpb, rpc_txt, write_image
+from rpc_fixtures import dimap_rpc, rpb, rpc_txt, write_image
 from zlocus.io.cameras.rpc import read_rpc
+from zlocus.products.rpc_copies import gdal_rpc
 from zlocus.sensors.rpc import RpcCoefficients
 
 # A pixel of a multispectral image is as wide as so many of the panchromatic one.

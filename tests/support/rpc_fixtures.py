@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
-from rasterio.rpc import RPC
 
+from zlocus.products.rpc_copies import gdal_rpc
 from zlocus.sensors.rpc import RpcCoefficients
 
 RPC_NAMES = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")
@@ -28,16 +28,6 @@ def satellite_rpc() -> RpcCoefficients:
         line_scale=20000.0, samp_scale=20000.0, lat_scale=0.09, lon_scale=0.125, height_scale=500.0,
         line_num=tuple(line_num.tolist()), line_den=tuple(line_den.tolist()),
         samp_num=tuple(samp_num.tolist()), samp_den=tuple(samp_den.tolist()),
-    )  # fmt: skip
-
-
-def gdal_rpc(rpc: RpcCoefficients) -> RPC:
-    """The same numbers as rasterio's object (which counts pixels as we do)."""
-    return RPC(
-        height_off=rpc.height_off, height_scale=rpc.height_scale, lat_off=rpc.lat_off, lat_scale=rpc.lat_scale,
-        long_off=rpc.lon_off, long_scale=rpc.lon_scale, line_off=rpc.line_off, line_scale=rpc.line_scale,
-        samp_off=rpc.samp_off, samp_scale=rpc.samp_scale, line_num_coeff=list(rpc.line_num),
-        line_den_coeff=list(rpc.line_den), samp_num_coeff=list(rpc.samp_num), samp_den_coeff=list(rpc.samp_den),
     )  # fmt: skip
 
 
