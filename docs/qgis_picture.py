@@ -13,42 +13,28 @@ from pathlib import Path
 HERE = Path(__file__).parent
 NAME = "delivery_qgis.png"
 # Part of the sides of the area, so that single houses and the labels of contours are seen.
-SHARE, SIZE_PX, DPI = 0.6, 640, 110
+SHARE, DPI = 0.6, 110
 
 
 def main() -> None:
     """Draw contours over relief in colours."""
     os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
-    from qgis.core import (
-        QgsApplication,
-        QgsMapRendererSequentialJob,
-        QgsMapSettings,
-        QgsRasterLayer,
-        QgsVectorLayer,
-    )
-    from qgis.PyQt.QtCore import QSize
-    from qgis.PyQt.QtGui import QColor
+    sys.path.insert(0, str(HERE.parent / "qgis"))
+    from qgis.core import QgsApplication
 
-    surface, folder = Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else HERE / "pictures"
+    from drawing import layer_of, picture
+
+    surface, folder = sys.argv[1], Path(sys.argv[2]) if len(sys.argv) > 2 else HERE / "pictures"
     application = QgsApplication([], False)
     application.initQgis()
-    contours = QgsVectorLayer(str(surface / "contours.gpkg"), "contours")
-    relief, heights = (QgsRasterLayer(str(surface / name), name) for name in ("hillshade.tif", "dsm.tif"))
-    settings = QgsMapSettings()
-    settings.setLayers([contours, heights, relief])
-    settings.setDestinationCrs(heights.crs())
-    extent = heights.extent()
+    layers = [layer_of(surface, name) for name in ("contours.gpkg", "dsm.tif", "hillshade.tif")]
+    extent = layers[1].extent()
     extent.scale(SHARE)
-    settings.setExtent(extent)
-    settings.setOutputSize(QSize(SIZE_PX, SIZE_PX))
-    settings.setOutputDpi(DPI)
-    settings.setBackgroundColor(QColor("white"))
-    job = QgsMapRendererSequentialJob(settings)
-    job.start()
-    job.waitForFinished()
-    if not job.renderedImage().save(str(folder / NAME)):
+    if not picture(layers, extent, DPI).save(str(folder / NAME)):
         sys.exit(f"{folder / NAME} cannot be written.")
-    application.exitQgis()
+    sys.stdout.flush()
+    # QGIS's objects may outlive each other in a wrong order.
+    os._exit(0)
 
 
 if __name__ == "__main__":

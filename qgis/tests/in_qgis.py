@@ -15,19 +15,17 @@ from qgis.core import (
     QgsLayerTreeModel,
     QgsLegendRenderer,
     QgsLegendSettings,
-    QgsMapRendererSequentialJob,
-    QgsMapSettings,
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
     QgsProject,
-    QgsRasterLayer,
-    QgsVectorLayer,
 )
-from qgis.PyQt.QtCore import QSize, Qt
-from qgis.PyQt.QtGui import QColor, QImage, QPainter
+from qgis.PyQt.QtCore import Qt
+from qgis.PyQt.QtGui import QImage, QPainter
 
-WIDTH, HEIGHT, DPI = 640, 640, 96
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from drawing import CLOUDS, VECTORS, layer_of, picture
+
 LONG_S = 60.0
 
 
@@ -45,29 +43,6 @@ def begin():
     plugin = zlocus_processing.classFactory(None)
     plugin.initProcessing()
     return application, plugin
-
-
-def layer_of(folder, name):
-    """A file as a layer, as if it was dropped into the window: with the style of its name."""
-    path = os.path.join(folder, name)
-    layer = QgsVectorLayer(path, name) if name.endswith(".gpkg") else QgsRasterLayer(path, name)
-    assert layer.isValid(), path
-    return layer
-
-
-def picture(layers, extent):
-    """A map of layers, the first one on top."""
-    settings = QgsMapSettings()
-    settings.setLayers(layers)
-    settings.setDestinationCrs(layers[0].crs())
-    settings.setExtent(extent)
-    settings.setOutputSize(QSize(WIDTH, HEIGHT))
-    settings.setOutputDpi(DPI)
-    settings.setBackgroundColor(QColor("white"))
-    job = QgsMapRendererSequentialJob(settings)
-    job.start()
-    job.waitForFinished()
-    return job.renderedImage()
 
 
 def legend(layer):
@@ -94,34 +69,44 @@ def n_colours(image):
 
 
 def draw(folder, out):
-    """Draw all products with their styles; say how, and what their legends say."""
+    """Draw all products of a folder and of those in it with their styles; say how, and what their legends say."""
     os.makedirs(out, exist_ok=True)
     found = {}
-    names = sorted(name for name in os.listdir(folder) if name.endswith((".tif", ".gpkg", ".vrt")))
-    extent = layer_of(folder, next(name for name in names if name.endswith(".tif"))).extent()
-    for name in names:
+    for name in names_in(folder):
         layer = layer_of(folder, name)
-        stem = os.path.splitext(name)[0]
+        stem = os.path.splitext(os.path.join(folder, name))[0]
+        extent = layer.extent()
+        extent.scale(1.05)
+        file = os.path.join(out, name.replace(os.sep, "_"))
         drawn = picture([layer], extent)
-        drawn.save(os.path.join(out, name + ".png"))
+        drawn.save(file + ".png")
         image, texts = legend(layer)
-        image.save(os.path.join(out, name + ".legend.png"))
+        image.save(file + ".legend.png")
         entry = {"renderer": layer.renderer().type(), "colours": n_colours(drawn), "legend": texts}
-        style = os.path.join(folder, stem + ".qml")
-        if os.path.isfile(style):
-            entry["qml"] = layer.loadNamedStyle(style)
+        if os.path.isfile(stem + ".qml"):
+            entry["qml"] = layer.loadNamedStyle(stem + ".qml")
             entry["reloaded"] = picture([layer], extent) == drawn
-        style = os.path.join(folder, stem + ".sld")
-        if os.path.isfile(style) and name.endswith(".gpkg"):
-            entry["sld"] = layer.loadSldStyle(style)
+        if os.path.isfile(stem + ".sld") and name.endswith(VECTORS):
+            entry["sld"] = layer.loadSldStyle(stem + ".sld")
             by_sld = picture([layer], extent)
-            by_sld.save(os.path.join(out, name + ".sld.png"))
+            by_sld.save(file + ".sld.png")
             entry["colours_by_sld"] = n_colours(by_sld)
         found[name] = entry
-    if {"dsm.tif", "hillshade.tif"} <= set(names):
-        relief = [layer_of(folder, name) for name in ("contours.gpkg", "dsm.tif", "hillshade.tif") if name in names]
-        picture(relief, extent).save(os.path.join(out, "relief.png"))
+    if {"dsm.tif", "hillshade.tif"} <= set(found):
+        relief = [layer_of(folder, name) for name in ("contours.gpkg", "dsm.tif", "hillshade.tif") if name in found]
+        picture(relief, relief[-1].extent()).save(os.path.join(out, "relief.png"))
     return found
+
+
+def names_in(folder):
+    """Names of the products in a folder and in those in it, without the tiles of a run."""
+    endings = (".tif", ".vrt", *VECTORS, *CLOUDS)
+    return sorted(
+        os.path.relpath(os.path.join(inner, name), folder)
+        for inner, folders, names in os.walk(folder)
+        for name in names
+        if name.endswith(endings)
+    )
 
 
 def load(folder):
