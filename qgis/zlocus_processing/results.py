@@ -21,6 +21,7 @@ class ShownFile(NamedTuple):
 
 # From the top of the list of layers to its bottom. The colours of heights darken the hillshade below them.
 SURFACE = (
+    ShownFile("footprints.geojson", "footprints of the images"),
     ShownFile("ties.gpkg", "tie points"),
     ShownFile("contours.gpkg", "contours", True),
     ShownFile("dsm.tif", "surface", True),

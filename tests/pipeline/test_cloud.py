@@ -251,7 +251,9 @@ def test_one_reference_is_kept_unconfirmed(images, tmp_path):
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS, "references": ("fore",)}
     result = run(images("plane").inputs, tmp_path / "out", copc=True, **asked)
     assert sorted(p.name for p in result.out.iterdir()) == [
-        "cloud.copc.laz", "cloud.laz", "cloud.ply", "finished.json", "fore_height.tif", "fore_quality.tif", "run.json",
+        "cloud.copc.laz", "cloud.copc.qml", "cloud.laz", "cloud.ply", "cloud.qml", "finished.json", "fore_height.qml",
+        "fore_height.sld", "fore_height.tif", "fore_quality.qml", "fore_quality.sld", "fore_quality.tif",
+        "fore_quality.tif.aux.xml", "fore_reasons.vrt", "run.json",
     ]  # fmt: skip
     assert not (read(result.out / "fore_quality.tif") & Quality.INCONSISTENT).any()
     assert "cloud.copc.laz" in json.loads((result.out / "finished.json").read_text())["products"]
@@ -264,7 +266,7 @@ def test_copc_is_made_of_a_finished_cloud(of_step, images, tmp_path, monkeypatch
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS}
     assert run(images("step").inputs, out, copc=True, **asked).was_finished
     changed = {path.name for path in out.iterdir() if before.get(path.name) != path.stat().st_mtime_ns}
-    assert changed == {"cloud.copc.laz", "finished.json"}
+    assert changed == {"cloud.copc.laz", "cloud.copc.qml", "finished.json"}
     checked_nodes(out / "cloud.copc.laz")
     check_laz(out / "cloud.copc.laz")
     one, other = (laspy.read(out / name).points.array for name in ("cloud.laz", "cloud.copc.laz"))

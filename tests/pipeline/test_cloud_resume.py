@@ -166,6 +166,7 @@ def test_another_cloud_replaces_all_maps(images, straight, tmp_path):
     out = Path(shutil.copytree(straight, tmp_path / "out"))
     made(images, out, references=("fore",), overwrite=True)
     assert sorted(path.name for path in out.glob("*.tif")) == ["fore_height.tif", "fore_quality.tif"]
+    assert not list(out.glob("nadir*"))
 
 
 def test_points_are_written_while_others_are_matched(images, tmp_path, monkeypatch):

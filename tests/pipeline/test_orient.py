@@ -79,7 +79,8 @@ def test_the_report(oriented):
     assert "3 of 6 directions" in report["unobservable"]
     assert set(report["cameras"]) == set(LOOKS)
     assert sorted(path.name for path in oriented.iterdir()) == [
-        "cameras", "observations.npz", "orientation.json", "run.json", "scene.yaml", "ties.gpkg",
+        "cameras", "observations.npz", "orientation.json", "run.json", "scene.yaml", "ties.gpkg", "ties.qml",
+        "ties.sld",
     ]  # fmt: skip
 
 
@@ -95,7 +96,9 @@ def test_the_surface_is_that_of_the_images_oriented_on_the_way(flawed, oriented,
 def test_ties_alone(flawed, tmp_path):
     result = invoke("ties", *flawed.inputs, "-o", tmp_path / "out", *HEIGHTS)
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["orientation.json", "run.json", "ties.gpkg"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "orientation.json", "run.json", "ties.gpkg", "ties.qml", "ties.sld",
+    ]  # fmt: skip
     report = json.loads((tmp_path / "out" / "orientation.json").read_text())
     assert report["model"] == "none"
     assert pyogrio.read_info(tmp_path / "out" / "ties.gpkg")["features"] == report["n_ties"]

@@ -116,6 +116,10 @@ def test_a_mosaic_is_levelled(made, tmp_path):
     for name in ("n1", "f1"):
         with rasterio.open(tmp_path / "out" / f"{name}_ortho.tif") as file:
             assert valid.sum() > (file.read_masks(1) > 0).sum()  # each shows what the other hides
+    made_of = [path.stem for path in (tmp_path / "out").glob("*.tif")]
+    assert {path.stem for path in (tmp_path / "out").glob("*.qml")} == set(made_of)
+    assert 'label="2 ' not in (tmp_path / "out" / "mosaic_images.qml").read_text()
+    assert 'label="f1"' in (tmp_path / "out" / "mosaic_images.qml").read_text()
 
 
 def test_images_of_different_bands_make_no_mosaic(made, tmp_path):

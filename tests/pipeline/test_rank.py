@@ -68,6 +68,7 @@ def test_two_images_are_ranked_too(images, tmp_path):
     said = rank(images("sine").inputs[:2], tmp_path / "out")
     assert said.splitlines()[-1].startswith("Buy a third image")
     assert len(json.loads((tmp_path / "out" / "ranking.json").read_text())["pairs"]) == 1
+    assert {path.name for path in (tmp_path / "out").glob("*.qml")} == {"ties.qml", "ranking.qml"}
 
 
 def test_same_ranking_with_two_workers_and_any_order(images, tmp_path):

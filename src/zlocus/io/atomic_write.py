@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -40,3 +40,21 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     except OSError as error:
         reason = error.strerror or str(error)
         raise OutputError(f"{path} cannot be written: {reason}. Check the folder and the space left.") from error
+
+
+def remove_earlier(folder: Path, names: Iterable[str]) -> None:
+    """Remove files of an earlier run from a folder, as far as they are there.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be removed.
+    """
+    for name in names:
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"{folder / name} is of an earlier run and cannot be removed: {error.strerror}. Remove it, or choose "
+                "another folder with -o."
+            ) from error

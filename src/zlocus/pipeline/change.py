@@ -138,7 +138,7 @@ def run_change(request: ChangeRequest, progress: Progress) -> CommandOutcome:
                 volumes = _volumes(request, pair, noise, features, progress)
             names = _names(features)
             write_volumes(request.out / TABLE, request.out / LAYER, features, names, volumes, pair.placed[0].grid_crs)
-        write_other_styles(request.out, (DIFFERENCE, SIGMAS, SIGNIFICANCE, CLASSES))
+        write_other_styles(request.out, (DIFFERENCE, SIGMAS, SIGNIFICANCE, CLASSES, LAYER))
         write_change_picture(request.out / PICTURE, request.out / DIFFERENCE, request.out / CLASSES, features, noise)
         inputs = inputs_record(
             [path for surface in surfaces for path in surface.files]

@@ -24,7 +24,9 @@ from zlocus.core.jit import CACHE
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import CloudRequest, check_output
+from zlocus.io.atomic_write import remove_earlier
 from zlocus.io.run_record import Stopwatch, origin_record, read_record, result_record, write_record
+from zlocus.io.styles.file_names import remove_styles
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.image_space import depth_options, is_by_depth
 from zlocus.matching.quality import Quality
@@ -76,6 +78,7 @@ from zlocus.pipeline.run_plan import (
     timed_stages,
 )
 from zlocus.pipeline.tile_run import MatchMethod
+from zlocus.products.other_styles import write_other_styles
 from zlocus.products.point_cloud import PointCloud, file_names, write_cloud_copc
 from zlocus.sensors.image_rays import DepthRays
 
@@ -139,7 +142,7 @@ def run_cloud(request: CloudRequest, config: RunConfig, progress: Progress) -> C
     with watch.stage("open"), progress.stage("Opening images"):
         run = open_cloud_run(request, config, progress)
         reference_names(run.opened_inputs.scene, request.references)  # refuses names that are none
-    finished = _already_finished(request, run, progress)
+    finished = _already_finished(request, config, run, progress)
     if finished is not None:
         return finished
     if run.finished is not None and CLOUD_COPC in run.finished.checksums:  # made again with the rest
@@ -204,6 +207,8 @@ def _made(
             names.append(CLOUD_COPC)
             with stopwatch.stage("copc"), progress.stage("COPC"):
                 write_cloud_copc(out)
+        with stopwatch.stage("styles"):
+            write_other_styles(out, names, prepared_cloud.config.products)
         coverage = share_with_height(matched, cloud.n_points)
         shortcoming = shortcoming_of(out / CLOUD_FILES[0], coverage, prepared_cloud.setup)
         record = {
@@ -246,9 +251,9 @@ def tiles_are_kept(checkpoint: TileCheckpoint, image_tiles: Sequence[ImageTile],
 def remove_earlier_cloud(out: Path) -> None:
     """Remove the products of an earlier run, so that old and new products never stand together."""
     earlier = read_finished(out)
-    maps = () if earlier is None else (name for name in earlier.checksums if is_map_of_image(name))
-    for name in (*CLOUD_FILES, CLOUD_COPC, *maps):
-        (out / name).unlink(missing_ok=True)
+    maps = [] if earlier is None else [name for name in earlier.checksums if is_map_of_image(name)]
+    remove_earlier(out, (*CLOUD_FILES, CLOUD_COPC, *maps))
+    remove_styles(out, (*CLOUD_FILES, CLOUD_COPC, *maps))
     remove_earlier_products(out, has_incomplete=False)
 
 
@@ -313,10 +318,10 @@ def match_cloud(
     return checked.result()
 
 
-def _already_finished(request: CloudRequest, run: OpenRun, progress: Progress) -> CloudResult | None:
+def _already_finished(request: CloudRequest, config: RunConfig, run: OpenRun, progress: Progress) -> CloudResult | None:
     """The result of a run that has finished before; None where there is none, or products of it are missing.
 
-    COPC that is asked for and not there is made from the points.
+    COPC that is asked for and not there is made from the points, and so are missing styles.
     """
     if run.finished is None:
         return None
@@ -325,11 +330,15 @@ def _already_finished(request: CloudRequest, run: OpenRun, progress: Progress) -
         progress.note(f"The finished run in {request.out} lacks {', '.join(gone)}: it is made again.")
         return None
     run.checkpoint.remove()  # where a run was stopped between its last file and its end
+    names, made = list(run.finished.checksums), list[str]()
     if request.copc and not (request.out / CLOUD_COPC).is_file():
         with progress.stage("COPC"):
             write_cloud_copc(request.out)
         update_finished(request.out, (CLOUD_COPC,))
-        progress.note(f"Made, for it was not there: {CLOUD_COPC}.")
+        names, made = [*names, CLOUD_COPC], [CLOUD_COPC]
+    made += write_other_styles(request.out, names, config.products, is_new=False)
+    if made:
+        progress.note(f"Made, for it was not there: {', '.join(made)}.")
     record = read_record(request.out / RECORD)
     n_points, coverage = int(record["points"]), float(record["coverage"])
     return _accepted(request, CloudResult(request.out, n_points, coverage, True, run.finished.shortcoming))

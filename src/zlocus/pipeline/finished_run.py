@@ -20,12 +20,11 @@ from zlocus.products.derived import FILES, link_all, write_derived
 from zlocus.products.metadata import METADATA
 from zlocus.products.report.file_names import CURVES, FOOTPRINTS, RANKING, RECORD, REPORT
 from zlocus.products.styles import missing_styles, write_styles
-from zlocus.products.tie_layers import write_ties
+from zlocus.products.tie_layers import TIES, write_ties
 from zlocus.products.tie_observations import OBSERVATIONS, read_observations, write_observations
 
 # Products that only matching makes.
 MATCHED = ("dsm.tif", "sigma.tif", "quality.tif", "views.tif", "ortho.tif", "water.tif", RANKING, RECORD)
-TIES = "ties.gpkg"
 # Products made from the tie points, which are kept or found again.
 OF_TIES = (TIES, OBSERVATIONS, FOOTPRINTS, CURVES)
 

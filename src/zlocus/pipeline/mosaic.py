@@ -330,7 +330,7 @@ def _write(
     stated = stating_datum(placement.surfaces)
     description = ELLIPSOIDAL_DESCRIPTION if stated.datum == ELLIPSOID else "height"
     with MosaicRasters(
-        request.out, placement.geobox, placement.spatial_geobox, description, job.has, job.ortho_bands
+        request.out, placement.geobox, placement.spatial_geobox, description, job.has, job.ortho_bands, request.inputs
     ) as rasters:
         with progress.stage("Joining", len(windows)) as stage:
             for window in set(windows) - set(reached):

@@ -31,7 +31,8 @@ from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.setup import open_inputs, orient_views
 from zlocus.products.corrected_cameras import SCENE, check_cameras_can_be_written, write_cameras
 from zlocus.products.orientation import orientation_record
-from zlocus.products.tie_layers import write_ties
+from zlocus.products.other_styles import write_other_styles
+from zlocus.products.tie_layers import TIES, write_ties
 from zlocus.products.tie_observations import write_observations
 
 # Cells of the terrain model are this many ground pixels, its own resolution being coarser.
@@ -77,7 +78,8 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         note_orientation(orientation, progress)
     corrected, checksums = orientation.apply(scene), inputs.record()
     with watch.stage("write"), made_folder(request.out):
-        write_ties(request.out / "ties.gpkg", orientation, corrected)
+        write_ties(request.out / TIES, orientation, corrected)
+        write_other_styles(request.out, (TIES,), config.products)
         record: dict[str, Any] = orientation_record(orientation, scene)
         if of_ortho is not None:
             record["control_ortho"] = of_ortho.found
@@ -89,7 +91,7 @@ def run_orient(request: OrientRequest, config: RunConfig, progress: Progress) ->
         write_record(request.out / ORIENTATION, record)
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))
     if not request.cameras:
-        return f"{request.out / 'ties.gpkg'}: {len(orientation.xyz)} tie points."
+        return f"{request.out / TIES}: {len(orientation.xyz)} tie points."
     return f"{request.out / SCENE}: {len(scene.views)} cameras, from {len(orientation.refined_xyz)} tie points."
 
 

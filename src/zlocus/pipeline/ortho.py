@@ -20,10 +20,12 @@ from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.requests import SetupRequest, check_output
 from zlocus.core.resources import cores
 from zlocus.core.scene import Scene, View
+from zlocus.io.atomic_write import remove_earlier
 from zlocus.io.ground_reference import OrthoReference, open_reference
 from zlocus.io.input_files import InputFiles
 from zlocus.io.run_record import Stopwatch, read_record, result_record, write_record
 from zlocus.io.scene_file import open_scene
+from zlocus.io.styles.file_names import remove_styles
 from zlocus.io.surface_heights import SurfaceHeights, open_surface
 from zlocus.orientation.ground_match import NoGroundMatch, match_to_ground
 from zlocus.orientation.orientation import Orientation
@@ -34,6 +36,7 @@ from zlocus.pipeline.recorded_run import config_of, request_of
 from zlocus.pipeline.setup import open_inputs, opencv_in_one_thread, orient_views, sorted_views
 from zlocus.products.ortho_images import OrthoSource, ortho_area, write_ortho
 from zlocus.products.ortho_mosaic import planned_mosaic, write_mosaic
+from zlocus.products.other_styles import write_other_styles
 from zlocus.products.point_cloud import file_names
 from zlocus.products.report.file_names import RECORD
 from zlocus.products.tie_observations import read_observations
@@ -107,6 +110,9 @@ def run_ortho(request: OrthoRequest, config: RunConfig, progress: Progress) -> d
         if mosaicked:
             with watch.stage("mosaic"), opencv_in_one_thread():
                 record["mosaic"] = make_mosaic(request, mosaicked, surface, progress, workers)
+        with watch.stage("styles"):
+            made = [part.path.name for part in parts] + [MOSAIC, MOSAIC_IMAGES] * bool(mosaicked)
+            write_other_styles(request.out, made, config.products)
         shared = result_record(request, config, inputs.record(), watch)
         write_record(request.out / ORTHO_RECORD, record | shared)
     return record
@@ -118,24 +124,27 @@ def complete_or_removed(out: Path, paths: Sequence[Path]) -> Iterator[None]:
 
     paths : of the ortho-images that are written.
     """
-    known = [out / name for name in ORTHO_FILES]
-    for path in (*earlier_files(out), *known):
-        path.unlink(missing_ok=True)
+    _remove(out, [*earlier_files(out), *ORTHO_FILES])
     try:
         yield
     except BaseException:
-        for path in (*paths, *known):
-            path.unlink(missing_ok=True)
+        _remove(out, [*(path.name for path in paths), *ORTHO_FILES])
         raise
 
 
-def earlier_files(out: Path) -> list[Path]:
-    """The ortho-images that the record in a folder names; none where it is missing or damaged."""
+def _remove(out: Path, names: Sequence[str]) -> None:
+    """Remove files with their styles."""
+    remove_earlier(out, names)
+    remove_styles(out, names)
+
+
+def earlier_files(out: Path) -> list[str]:
+    """Names of the ortho-images that the record in a folder lists; none where it is missing or damaged."""
     try:
         names = [str(each["file"]) for each in read_record(out / ORTHO_RECORD)["images"].values()]
     except (ZlocusError, KeyError, AttributeError, TypeError):
         return []
-    return [out / name for name in names if Path(name).name == name and name.endswith(ENDING)]
+    return [name for name in names if Path(name).name == name and name.endswith(ENDING)]
 
 
 def views_of_run(folder: Path, progress: Progress) -> dict[Path, View]:

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from zlocus.core.errors import OutputError
 from zlocus.core.requests import FINISHED
+from zlocus.io.atomic_write import remove_earlier
 from zlocus.products.derived import remove_derived
 from zlocus.products.report.file_names import remove_report
+from zlocus.products.tie_layers import TIES
 from zlocus.products.tie_observations import OBSERVATIONS
 
 # Names of files that are not complete yet; they contain the number of the process that writes them.
@@ -44,11 +46,15 @@ def remove_earlier_products(out: Path, has_incomplete: bool = True) -> None:
     """Remove the products of an earlier run, so that old and new products never stand together.
 
     has_incomplete : whether incomplete files are those of earlier runs, and removed too.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be removed.
     """
     remove_derived(out)
     remove_report(out)
-    for name in (FINISHED, "run.json", "ties.gpkg", OBSERVATIONS):
-        (out / name).unlink(missing_ok=True)
+    remove_earlier(out, (FINISHED, "run.json", TIES, OBSERVATIONS))
     if has_incomplete:
         remove_incomplete_files(out)
 

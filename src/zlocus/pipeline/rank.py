@@ -23,7 +23,9 @@ from zlocus.pipeline.orient import check_ties
 from zlocus.pipeline.output_folder import made_folder
 from zlocus.pipeline.rank_advice import SharedPoints, advice
 from zlocus.pipeline.setup import RunSetup, open_inputs, orient_views, set_up_run
-from zlocus.products.tie_layers import counted_pairs, label_counts, write_ranking, write_ties
+from zlocus.products.other_styles import write_other_styles
+from zlocus.products.report.file_names import RANKING
+from zlocus.products.tie_layers import TIES, counted_pairs, label_counts, write_ranking, write_ties
 
 RANKING_TABLE = "ranking.json"
 
@@ -55,8 +57,9 @@ def run_rank(request: RankRequest, config: RunConfig, progress: Progress) -> str
         labelled_ties = rank_tiles(setup, request.workers, config, progress)
     names, checksums = [view.name for view in setup.match_scene.views], inputs.record()
     with watch.stage("write"), made_folder(request.out):
-        write_ties(request.out / "ties.gpkg", orientation, setup.scene)
-        write_ranking(request.out / "ranking.gpkg", labelled_ties, names, setup.scene.crs)
+        write_ties(request.out / TIES, orientation, setup.scene)
+        write_ranking(request.out / RANKING, labelled_ties, names, setup.scene.crs)
+        write_other_styles(request.out, (TIES, RANKING), config.products)
         counts = label_counts(labelled_ties, len(names))
         write_record(request.out / RANKING_TABLE, ranking_record(counts, names))
     write_record(request.out / "run.json", result_record(request, config, checksums, watch))

@@ -43,7 +43,7 @@ from zlocus.products.report.file_names import CURVES, RECORD
 from zlocus.products.stac_item import STYLES
 from zlocus.products.styles import write_styles
 from zlocus.products.surface_statistics import surface_statistics
-from zlocus.products.tie_layers import write_ranking, write_ties
+from zlocus.products.tie_layers import TIES, write_ranking, write_ties
 from zlocus.products.tie_observations import write_observations
 
 # A surface with heights for a smaller share of the cells seen by two images is no success.
@@ -66,7 +66,7 @@ def surface_rasters(request: DsmRequest, setup: RunSetup, vertical_datum: Vertic
 def write_points(out: Path, setup: RunSetup, labelled_ties: list[LabelledTies], vertical_datum: VerticalDatum) -> None:
     """Write tie points (ties.gpkg), their image observations, and the ranking of images where there is one."""
     orientation, scene = setup.orientation, setup.scene
-    write_ties(out / "ties.gpkg", orientation, scene, vertical_datum)
+    write_ties(out / TIES, orientation, scene, vertical_datum)
     if orientation.refined_ties is not None:
         write_observations(out, orientation.refined_ties)
     if labelled_ties:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from pathlib import Path
 
-from zlocus.core.errors import ConfigError, OutputError, ZlocusError
+from zlocus.core.errors import ConfigError, ZlocusError
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import Progress
+from zlocus.io.atomic_write import remove_earlier
 from zlocus.io.styles.file_names import OF_SURFACE, remove_styles
 from zlocus.products.contours import write_contours
 from zlocus.products.dtm import write_dtm
@@ -85,15 +85,7 @@ def remove_derived(folder: Path) -> None:
     OutputError
         A file cannot be removed.
     """
-    for name in (*FILES.values(), METADATA, "item.json", "ranking.gpkg"):
-        try:
-            with suppress(FileNotFoundError):
-                (folder / name).unlink()
-        except OSError as error:
-            raise OutputError(
-                f"{folder / name} is of an earlier run and cannot be removed: {error.strerror}. Remove it, or choose "
-                "another folder with -o."
-            ) from error
+    remove_earlier(folder, (*FILES.values(), METADATA, "item.json", "ranking.gpkg"))
     remove_styles(folder, OF_SURFACE)
 
 

@@ -19,6 +19,7 @@ from zlocus.io.surface_cells import PlacedSurface, SurfaceCells, read_cells
 from zlocus.io.surface_inputs import DSM, ORTHO, QUALITY, SIGMA, VIEWS, WATER
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.blending import BlendedCells, RunRelations, SeamKind, blended, halo_cells
+from zlocus.products.number_names import RUNS, number_tag
 from zlocus.products.rasters import COLOURS, flag_tags
 from zlocus.products.run_offsets import PairSample, sampled_pairs
 
@@ -116,7 +117,7 @@ class MosaicRasters:
     """Writer of the rasters of a mosaic. The files appear when the context ends without an error.
 
     spatial_geobox : grid with the vertical datum, for the heights; geobox : without it, for the others; description :
-    of the heights; has : which of views.tif and water.tif are made; ortho_bands : see `MosaicJob`.
+    of the heights; has : which of views.tif and water.tif are made; ortho_bands : see `MosaicJob`; runs : their names.
     """
 
     def __init__(
@@ -127,6 +128,7 @@ class MosaicRasters:
         description: str,
         has: Sequence[str],
         ortho_bands: tuple[str, int] | None,
+        runs: Sequence[str],
     ) -> None:
         nan = float("nan")
         bands = {
@@ -135,7 +137,9 @@ class MosaicRasters:
             QUALITY: RasterBands("uint16", None, ("quality bit flags",), tags=flag_tags()),
             VIEWS: RasterBands("uint8", 0, ("images used by the run in source.tif",)),
             WATER: RasterBands("uint8", None, ("water surface",)),
-            SOURCE: RasterBands("uint16", 0, ("number of the run that was chosen, from 1",)),
+            SOURCE: RasterBands(
+                "uint16", 0, ("number of the run that was chosen, from 1",), tags={RUNS: number_tag(runs)}
+            ),
             SEAMS: RasterBands("uint8", 0, ("how the height was made",), tags=_seam_tags()),
         }
         names = [DSM, SIGMA, QUALITY, SOURCE, SEAMS, *has]

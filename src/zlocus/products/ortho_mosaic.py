@@ -19,6 +19,7 @@ from zlocus.io.rasters import RasterBands, RasterSink
 from zlocus.io.surface_heights import SurfaceHeights
 from zlocus.matching.colour_levels import ColourLevels, colour_levels, overlap_of
 from zlocus.matching.seams import preferred_images, seamed_images
+from zlocus.products.number_names import IMAGES, number_tag
 from zlocus.products.ortho_images import OrthoBlock, OrthoSource, blocks_of, ortho_block, raster_bands, stored
 
 # A block of the mosaic, the cells around it that its seams depend on, how far seams may lie from the preferred border,
@@ -140,8 +141,8 @@ def write_mosaic(path: Path, images_path: Path, plan: MosaicPlan, progress: Prog
     """
     first, (rows, cols) = plan.sources[0], plan.geobox.shape
     blocks = [(row, col) for row in range(0, rows, BLOCK_CELLS) for col in range(0, cols, BLOCK_CELLS)]
-    names = "; ".join(f"{number} {source.name}" for number, source in enumerate(plan.sources, 1))
-    image_bands = RasterBands(np.uint16, 0, ("number of the image",), tags={"IMAGES": names})
+    names = number_tag([source.name for source in plan.sources])
+    image_bands = RasterBands(np.uint16, 0, ("number of the image",), tags={IMAGES: names})
     total = np.zeros(len(plan.sources) + 1, np.int64)
     with (
         RasterSink(path, plan.geobox, raster_bands(first)) as sink,

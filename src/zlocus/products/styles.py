@@ -11,18 +11,20 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.enums import MaskFlags
+from rasterio.enums import ColorInterp, MaskFlags
 
 from zlocus.core.options import ProductOptions
 from zlocus.io.atomic_write import write_atomically
 from zlocus.io.open_raster import open_raster
 from zlocus.io.row_strips import BandReader
+from zlocus.io.safe_documents import read_json
 from zlocus.io.styles.file_names import OF_SURFACE, remove_styles, style_files
 from zlocus.io.styles.layer_style import (
     ClassStyle,
     Colour,
     FeatureStyle,
     LayerStyle,
+    PointCloudStyle,
     RampStyle,
     StretchStyle,
     StyleRule,
@@ -58,7 +60,10 @@ MAX_COUNTS = 32
 MAX_INDEX_CONTOURS = 200
 # Values of a smaller range are drawn as if it were 1.
 MIN_SPAN = 1e-3
-CONTOUR_MM, INDEX_CONTOUR_MM, POINT_MM = 0.15, 0.35, 1.6
+CONTOUR_MM, INDEX_CONTOUR_MM, POINT_MM, FOOTPRINT_MM = 0.15, 0.35, 1.6, 0.4
+# Overlaps of all pairs of images above each other, and of one pair at least.
+IMAGE_INK, ALL_OVERLAPS_OPACITY, MIN_OPACITY = (40, 40, 40), 0.85, 0.03
+COLOURS = ("red", "green", "blue")
 # Okabe and Ito.
 BLUE, SKY_BLUE, ORANGE, VERMILION = (0, 114, 178), (86, 180, 233), (230, 159, 0), (213, 94, 0)
 NAMES_OF_WATER = {
@@ -87,8 +92,7 @@ def write_styles(folder: Path, options: ProductOptions, renewed: Collection[str]
     if not options.styles:
         return
     for product in styled_products(folder):
-        if any(not (folder / name).exists() for name in style_files(product)):
-            write_style(folder / product, MAKERS[product], options)
+        write_style(folder / product, MAKERS[product], options)
 
 
 def missing_styles(folder: Path, options: ProductOptions) -> tuple[str, ...]:
@@ -105,30 +109,41 @@ def styled_products(folder: Path) -> tuple[str, ...]:
 Maker = Callable[[Path, ProductOptions], LayerStyle | FlagValues]
 
 
-def write_style(path: Path, make: Maker, options: ProductOptions) -> None:
-    """Write the style files of a product that are missing. make : its style, or the values of its flags."""
+def write_style(path: Path, make: Maker, options: ProductOptions) -> list[str]:
+    """Write the style files of a product that are missing, and return their names.
+
+    make : its style, or the values of its flags.
+    """
+    missing = [name for name in style_files(path.name) if not (path.parent / name).exists()]
+    if not missing:
+        return []
     made = make(path, options)
     style = made.style() if isinstance(made, FlagValues) else made
+    of_servers = () if isinstance(style, PointCloudStyle) else (sld_of(style, path.stem),)
     of_flags = (made.table(), made.reasons()) if isinstance(made, FlagValues) else ()
-    texts = (qml_of(style), sld_of(style, path.stem), *of_flags)
+    texts = (qml_of(style), *of_servers, *of_flags)
     for name, text in zip(style_files(path.name), texts, strict=True):
-        if not (path.parent / name).exists():
+        if name in missing:
             write_atomically(path.parent / name, partial(Path.write_text, data=text, encoding="utf-8"))
+    return missing
 
 
 def _heights(path: Path, options: ProductOptions) -> RampStyle:
+    return even_ramp(*round_span(path), HEIGHT_COLOURS, "m", is_multiplied=True)
+
+
+def round_span(path: Path) -> tuple[float, float]:
+    """Round numbers around nearly all values of a raster."""
     low, high = percentiles(sampled(path), SPAN_PERCENT)
     step = 10.0 ** (math.floor(math.log10(high - low)) - 1)
-    return even_ramp(
-        math.floor(low / step) * step, math.ceil(high / step) * step, HEIGHT_COLOURS, "m", is_multiplied=True
-    )
+    return math.floor(low / step) * step, math.ceil(high / step) * step
 
 
 def _sigmas(path: Path, options: ProductOptions) -> RampStyle:
     high = rounded_up(percentiles(sampled(path), SPAN_PERCENT)[1])
     # Squares give the many small values different colours, as in the report.
     values = high * np.linspace(0.0, 1.0, N_STOPS) ** 2
-    return _ramp(values, _table(cv2.COLORMAP_CIVIDIS, N_STOPS), _decimals(high) + 1, "m")
+    return _ramp(values, table_colours(cv2.COLORMAP_CIVIDIS), _decimals(high) + 1, "m")
 
 
 def _hillshade(path: Path, options: ProductOptions) -> StretchStyle:
@@ -136,25 +151,40 @@ def _hillshade(path: Path, options: ProductOptions) -> StretchStyle:
     return StretchStyle(((DARKEST - SHADE_GREY, BRIGHTEST - SHADE_GREY),))
 
 
-def _ortho(path: Path, options: ProductOptions) -> StretchStyle:
+def image_style(path: Path, options: ProductOptions) -> StretchStyle:
+    """The style of an ortho-image: in its colours, or grey where it has fewer than three bands."""
     with open_raster(path, "raster") as file:
-        bands = range(1, 4) if file.count >= 3 else range(1, 2)
-        has_mask = MaskFlags.per_dataset in file.mask_flag_enums[0]
-    return StretchStyle(tuple(percentiles(sampled(path, band), STRETCH_PERCENT) for band in bands), has_mask)
+        bands = _colour_bands(file.colorinterp, file.descriptions)
+        # QGIS shows a mask as one more band.
+        mask_band = file.count + 1 if MaskFlags.per_dataset in file.mask_flag_enums[0] else None
+    ranges = tuple(percentiles(sampled(path, band), STRETCH_PERCENT) for band in bands)
+    return StretchStyle(ranges, bands, mask_band)
+
+
+def _colour_bands(meanings: Sequence[ColorInterp], names: Sequence[str | None]) -> tuple[int, ...]:
+    """Numbers of the bands of red, green and blue: by what the file says they mean, by their names, or the first."""
+    if len(meanings) < len(COLOURS):
+        return (1,)
+    by_name = [(name or "").lower() for name in names]
+    for known in ([meaning.name for meaning in meanings], by_name):
+        if all(known.count(colour) == 1 for colour in COLOURS):
+            return tuple(known.index(colour) + 1 for colour in COLOURS)
+    return (1, 2, 3)
 
 
 def _counts(path: Path, options: ProductOptions) -> ClassStyle | RampStyle:
     with BandReader(path) as reader:
         low, high = int(reader.statistic("MINIMUM") or 1), int(reader.statistic("MAXIMUM") or 1)
     if high - low >= MAX_COUNTS:
-        return _ramp(np.linspace(low, high, N_STOPS), _table(cv2.COLORMAP_VIRIDIS, N_STOPS), 0, "images")
+        return _ramp(np.linspace(low, high, N_STOPS), table_colours(cv2.COLORMAP_VIRIDIS), 0, "images")
     # The colours of the report, in which 1 is the darkest.
-    colours = _table(cv2.COLORMAP_VIRIDIS, high)
+    colours = table_colours(cv2.COLORMAP_VIRIDIS, high)
     counts = range(low, high + 1)
     return ClassStyle(tuple(ValueColour(k, colours[k - 1], f"{k} image{'s' * (k > 1)}") for k in counts))
 
 
-def _flags(path: Path, options: ProductOptions) -> FlagValues:
+def flag_values(path: Path, options: ProductOptions) -> FlagValues:
+    """The values of a raster of flags, which have a style, a table and groups."""
     return FlagValues.of(path)
 
 
@@ -181,7 +211,7 @@ def _contours(path: Path, options: ProductOptions) -> FeatureStyle:
     decimals = len(number(index_m).partition(".")[2])
     index = StyleRule(f"every {number(index_m)} m", colour, INDEX_CONTOUR_MM, ranges, index_m, is_labelled=True)
     return FeatureStyle(
-        "elevation_m", True, (index, StyleRule(f"every {number(interval_m)} m", colour, CONTOUR_MM)), decimals
+        "elevation_m", "line", (index, StyleRule(f"every {number(interval_m)} m", colour, CONTOUR_MM)), decimals
     )
 
 
@@ -191,7 +221,7 @@ def _ties(path: Path, options: ProductOptions) -> FeatureStyle:
         label = f"residual below {high:g} px" if high < math.inf else f"residual of {low:g} px or more"
         rules.append(StyleRule(label, colour, POINT_MM, ((low, high),)))
         low = high
-    return FeatureStyle("residual_px", False, tuple(rules))
+    return FeatureStyle("residual_px", "point", tuple(rules))
 
 
 def _ranking(path: Path, options: ProductOptions) -> FeatureStyle:
@@ -201,7 +231,21 @@ def _ranking(path: Path, options: ProductOptions) -> FeatureStyle:
         label = f"{n}{' or more' * is_last} image{'s' * (n != 1)} that match well"
         ends = (n - 0.5 if n else -math.inf, math.inf if is_last else n + 0.5)
         rules.append(StyleRule(label, colour, POINT_MM, (ends,)))
-    return FeatureStyle("n_good", False, tuple(rules))
+    return FeatureStyle("n_good", "point", tuple(rules))
+
+
+def _footprints(path: Path, options: ProductOptions) -> FeatureStyle:
+    """Outlines with the names of the images; ground is the darker, the more pairs of images show it."""
+    kinds = [feature["properties"]["kind"] for feature in read_json(path)["features"]]
+    opacity = max(1.0 - (1.0 - ALL_OVERLAPS_OPACITY) ** (1.0 / max(kinds.count("overlap"), 3)), MIN_OPACITY)
+    image = StyleRule("image", IMAGE_INK, FOOTPRINT_MM, value="image", is_labelled=True)
+    overlap = StyleRule("overlap of two images", BLUE, 0.0, value="overlap", opacity=round(opacity, 4))
+    return FeatureStyle("kind", "polygon", (overlap, image), text_attribute="name")
+
+
+def point_cloud_style(path: Path, options: ProductOptions) -> PointCloudStyle:
+    """Points in their own colours."""
+    return PointCloudStyle()
 
 
 def sampled(path: Path, band: int = 1) -> NDArray[np.float64]:
@@ -244,16 +288,17 @@ def _ramp(
         ValueColour(round(float(value), 6), colour, f"{value:.{decimals}f} {unit}")
         for value, colour in zip(values, colours, strict=True)
     )
-    return RampStyle(stops, is_multiplied)
+    return RampStyle(stops, unit, is_multiplied)
 
 
-def _table(table: int, n: int) -> list[Colour]:
+def table_colours(table: int, n: int = N_STOPS) -> list[Colour]:
     """Colours of one of OpenCV's tables, from its start to its end."""
     return [(int(red), int(green), int(blue)) for blue, green, red in ramp(table, n)]
 
 
 MAKERS: dict[str, Maker] = {
-    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "quality.tif": _flags, "views.tif": _counts,
-    "ortho.tif": _ortho, "water.tif": named_classes(NAMES_OF_WATER), "hillshade.tif": _hillshade,
-    "contours.gpkg": _contours, "ties.gpkg": _ties, "ranking.gpkg": _ranking,
+    "dsm.tif": _heights, "dtm.tif": _heights, "sigma.tif": _sigmas, "quality.tif": flag_values, "views.tif": _counts,
+    "ortho.tif": image_style, "water.tif": named_classes(NAMES_OF_WATER), "hillshade.tif": _hillshade,
+    "contours.gpkg": _contours, "surface.laz": point_cloud_style, "surface.copc.laz": point_cloud_style,
+    "ties.gpkg": _ties, "ranking.gpkg": _ranking, "footprints.geojson": _footprints,
 }  # fmt: skip

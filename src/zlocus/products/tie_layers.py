@@ -24,6 +24,7 @@ from zlocus.orientation.triangulate import project_points
 
 # Shapely geometries (n,) and their columns, (n,) each.
 Batch = tuple[NDArray[np.object_], dict[str, NDArray[np.generic]]]
+TIES = "ties.gpkg"
 LABELS = ("good", "fair", "poor")
 # Prefix of the columns with labels, and name of the column that holds all labels as text.
 LABEL, TEXT = "label_", "labels"

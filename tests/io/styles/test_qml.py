@@ -10,6 +10,7 @@ import pytest
 from zlocus.io.styles.layer_style import (
     ClassStyle,
     FeatureStyle,
+    PointCloudStyle,
     RampStyle,
     StretchStyle,
     StyleRule,
@@ -33,16 +34,17 @@ def test_numbers_have_no_exponent_and_no_needless_digit():
 
 
 def test_a_ramp_has_its_stops():
-    root = read(RampStyle(STOPS, is_multiplied=True))
+    root = read(RampStyle(STOPS, "m", is_multiplied=True))
     renderer = root.find("pipe/rasterrenderer")
     assert (renderer.get("type"), renderer.get("classificationMin"), renderer.get("classificationMax")) == (
         "singlebandpseudocolor", "-1.5", "100.25",
     )  # fmt: skip
     shader = root.find(".//colorrampshader")
     assert shader.get("colorRampType") == "INTERPOLATED"
-    assert [(item.get("value"), item.get("color"), item.get("label")) for item in shader] == [
+    assert [(item.get("value"), item.get("color"), item.get("label")) for item in shader.iter("item")] == [
         ("-1.5", "#000010", "-1.5 m"), ("100.25", "#ff0000", "100.25 <m> & more"),
     ]  # fmt: skip
+    assert shader.find("rampLegendSettings").get("suffix") == " m"
     assert root.findtext("blendMode") == str(MULTIPLY)
     assert read(RampStyle(STOPS)).findtext("blendMode") == "0"
 
@@ -55,19 +57,23 @@ def test_classes_are_not_averaged():
 
 
 @pytest.mark.parametrize(
-    ("n_bands", "kind", "alpha"), [(1, "singlebandgray", "2"), (3, "multibandcolor", "4")], ids=["grey", "colours"]
-)
-def test_a_mask_is_one_more_band(n_bands, kind, alpha):
-    renderer = read(StretchStyle(((5.0, 80.5),) * n_bands, has_mask=True)).find("pipe/rasterrenderer")
-    assert (renderer.get("type"), renderer.get("alphaBand")) == (kind, alpha)
-    assert [found.text for found in renderer.iter("minValue")] == ["5"] * n_bands
-    assert [found.text for found in renderer.iter("maxValue")] == ["80.5"] * n_bands
+    ("bands", "kind", "shown"),
+    [((1,), "singlebandgray", {"grayBand": "1"}),
+     ((5, 3, 2), "multibandcolor", {"redBand": "5", "greenBand": "3", "blueBand": "2"})],
+    ids=["grey", "colours"],
+)  # fmt: skip
+def test_an_image_has_its_bands_and_its_mask(bands, kind, shown):
+    renderer = read(StretchStyle(((5.0, 80.5),) * len(bands), bands, 9)).find("pipe/rasterrenderer")
+    assert (renderer.get("type"), renderer.get("alphaBand")) == (kind, "9")
+    assert {name: renderer.get(name) for name in shown} == shown
+    assert [found.text for found in renderer.iter("minValue")] == ["5"] * len(bands)
+    assert [found.text for found in renderer.iter("maxValue")] == ["80.5"] * len(bands)
     assert read(StretchStyle(((5.0, 80.5),))).find("pipe/rasterrenderer").get("alphaBand") == "-1"
 
 
 def test_rules_choose_features_and_labels():
     index = StyleRule("every 2.5 m", RED, 0.4, ((2.25, 2.75),), every=2.5, is_labelled=True)
-    root = read(FeatureStyle("elevation_m", True, (index, StyleRule("others", BLUE, 0.2)), decimals=1))
+    root = read(FeatureStyle("elevation_m", "line", (index, StyleRule("others", BLUE, 0.2)), decimals=1))
     rules = root.findall("renderer-v2/rules/rule")
     multiple = 'abs("elevation_m" / 2.5 - round("elevation_m" / 2.5)) < 0.000001'
     assert [(rule.get("label"), rule.get("filter"), rule.get("symbol")) for rule in rules] == [
@@ -83,9 +89,30 @@ def test_rules_choose_features_and_labels():
 
 def test_ranges_include_their_lower_end():
     low = StyleRule("low", RED, 1.0, ((-math.inf, 0.5), (7.0, 8.0)))
-    root = read(FeatureStyle("residual_px", False, (low, StyleRule("high", RED, 1.0, ((0.5, math.inf),)))))
+    root = read(FeatureStyle("residual_px", "point", (low, StyleRule("high", RED, 1.0, ((0.5, math.inf),)))))
     assert [rule.get("filter") for rule in root.findall("renderer-v2/rules/rule")] == [
         '("residual_px" < 0.5) OR ("residual_px" >= 7 AND "residual_px" < 8)', '("residual_px" >= 0.5)',
     ]  # fmt: skip
     assert root.find("labeling") is None
     assert {symbol.get("type") for symbol in root.iter("symbol")} == {"marker"}
+
+
+def test_polygons_are_chosen_by_a_text_and_named_by_another():
+    """Insides without an outline, and outlines without an inside, along which the name is written."""
+    inside = StyleRule("overlap", BLUE, 0.0, value="overlap", opacity=0.2)
+    outline = StyleRule("image", RED, 0.4, value="image", is_labelled=True)
+    root = read(FeatureStyle("kind", "polygon", (inside, outline), text_attribute="name"))
+    assert [rule.get("filter") for rule in root.findall("renderer-v2/rules/rule")] == [
+        "\"kind\" = 'overlap'", "\"kind\" = 'image'",
+    ]  # fmt: skip
+    drawn = [{part.get("name"): part.get("value") for part in symbol.iter("Option")} for symbol in root.iter("symbol")]
+    assert [(each["style"], each["outline_style"]) for each in drawn] == [("solid", "no"), ("no", "solid")]
+    assert drawn[0]["color"] == "0,0,16,51"
+    (label,) = root.findall("labeling/rules/rule")
+    assert (label.get("filter"), label.find("settings/text-style").get("fieldName")) == ("\"kind\" = 'image'", '"name"')
+
+
+def test_points_of_a_cloud_have_their_own_colours():
+    renderer = read(PointCloudStyle()).find("renderer")
+    assert [renderer.get(name) for name in ("type", "red", "green", "blue")] == ["rgb", "Red", "Green", "Blue"]
+    assert [each.text for each in renderer.iter("maxValue")] == ["65535"] * 3

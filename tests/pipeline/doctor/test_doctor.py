@@ -512,7 +512,8 @@ def test_too_little_memory(good, tmp_path):
 def test_an_earlier_look_leaves_no_footprints(healthy, good, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "footprints.png").write_bytes(b"of another look")
+    for ending in ("png", "qml", "sld"):
+        (out / f"footprints.{ending}").write_bytes(b"of another look")
     (out / "dsm.tif").write_bytes(b"of a run")
     doctor(out, tmp_path / "a.tif", tmp_path / "b.tif")
     assert sorted(path.name for path in out.iterdir()) == ["doctor.json", "dsm.tif"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 # Red, green and blue, 0 to 255.
 Colour = tuple[int, int, int]
@@ -22,10 +23,12 @@ class ValueColour:
 class RampStyle:
     """A quantity: colours are interpolated between stops, from the lowest on, and stay the same beyond them.
 
-    is_multiplied : the colours darken what lies below the layer, such as a hillshade.
+    unit : of the values, for the legend; is_multiplied : the colours darken what lies below the layer, such as a
+    hillshade.
     """
 
     stops: tuple[ValueColour, ...]
+    unit: str = ""
     is_multiplied: bool = False
 
 
@@ -38,11 +41,16 @@ class ClassStyle:
 
 @dataclass(frozen=True)
 class StretchStyle:
-    """An image: one grey band, or red, green and blue. ranges : values of each band that are black and full; has_mask :
-    whether a mask says where it has values."""
+    """An image: one grey band, or red, green and blue.
+
+    ranges : values of each band that are black and full; bands : numbers of these bands in the file, from 1;
+    mask_band : number of the band that says where the image has values, None without one. QGIS shows a mask as one more
+    band.
+    """
 
     ranges: tuple[tuple[float, float], ...]
-    has_mask: bool = False
+    bands: tuple[int, ...] = (1,)
+    mask_band: int | None = None
 
 
 RasterStyle = RampStyle | ClassStyle | StretchStyle
@@ -52,10 +60,11 @@ RasterStyle = RampStyle | ClassStyle | StretchStyle
 class StyleRule:
     """How some features of a layer are drawn.
 
-    size_mm : width of a line, or diameter of a point. ranges : the features have an attribute from the first number of
-    one of these on, below its second; every : or, where it is given, one that is a multiple of it, and `ranges` says
-    the same for programs that do not compute, empty where it cannot. A rule with neither is for all other features.
-    is_labelled : whether the attribute is written beside.
+    size_mm : width of a line or an outline, or diameter of a point. ranges : the features have an attribute from the
+    first number of one of these on, below its second; every : or, where it is given, one that is a multiple of it, and
+    `ranges` says the same for programs that do not compute, empty where it cannot; value : or, where it is given, the
+    attribute is this text. A rule with none of them is for all other features. is_labelled : whether the feature has a
+    label. opacity : of the inside of a polygon, 0 to 1.
     """
 
     label: str
@@ -63,20 +72,33 @@ class StyleRule:
     size_mm: float
     ranges: tuple[tuple[float, float], ...] = ()
     every: float | None = None
+    value: str | None = None
     is_labelled: bool = False
+    opacity: float = 0.0
 
 
 @dataclass(frozen=True)
 class FeatureStyle:
-    """Lines or points, drawn by rules on one attribute. decimals : of labels."""
+    """Points, lines or polygons, drawn by rules on one attribute.
+
+    decimals : of labels, which are the attribute; text_attribute : the one that labels are instead, "" for none.
+    """
 
     attribute: str
-    is_line: bool
+    shape: Literal["point", "line", "polygon"]
     rules: tuple[StyleRule, ...]
     decimals: int = 0
+    text_attribute: str = ""
 
 
-LayerStyle = RasterStyle | FeatureStyle
+@dataclass(frozen=True)
+class PointCloudStyle:
+    """A point cloud in its own colours, of 16 bits. size_mm : side of a point."""
+
+    size_mm: float = 1.0
+
+
+LayerStyle = RasterStyle | FeatureStyle | PointCloudStyle
 
 
 def hexadecimal(colour: Colour) -> str:

@@ -8,6 +8,7 @@ from zlocus.io.styles.layer_style import (
     ClassStyle,
     FeatureStyle,
     LayerStyle,
+    PointCloudStyle,
     RampStyle,
     RasterStyle,
     StretchStyle,
@@ -21,18 +22,40 @@ from zlocus.io.styles.xml_nodes import document, node
 VERSION = "3.22.0"
 # Numbers that QGIS gives to these.
 NORMAL, MULTIPLY = 0, 6
-PLACED_ALONG_LINE, ON_LINE = 3, 1
+PLACED_ALONG_LINE, PLACED_INSIDE, PLACED_ALONG_OUTLINE = 3, 4, 7
+ON_LINE, BELOW_LINE = 1, 4
 COLOUR_BANDS = ("red", "green", "blue")
+BRIGHTEST_POINT = 65535
 # Attributes this close to a multiple are one, in shares of it.
 MULTIPLE_TOLERANCE = 1e-6
 LABEL_POINTS, BUFFER_MM, OUTLINE_MM = 7, 0.6, 0.1
+# Without it QGIS takes the thinnest font; QGIS with Qt 6 counts otherwise, and goes by the name of the style.
+NORMAL_WEIGHT = "50"
+# Points of a cloud that are closer together on the screen are left out.
+POINT_DISTANCE_MM = 0.3
 
 
 def qml_of(style: LayerStyle) -> str:
     """The text of a style file."""
     if isinstance(style, FeatureStyle):
         return document(_feature_root(style))
+    if isinstance(style, PointCloudStyle):
+        return document(_cloud_root(style))
     return document(_raster_root(style))
+
+
+def _cloud_root(style: PointCloudStyle) -> Element:
+    """The same for all point clouds: QGIS would take the brightest point for white."""
+    names = {name: name.title() for name in COLOUR_BANDS}
+    white = (_enhancement(f"{name}ContrastEnhancement", 0, BRIGHTEST_POINT) for name in COLOUR_BANDS)
+    renderer = node(
+        "renderer", *white, type="rgb", **names, pointSize=number(style.size_mm), pointSizeUnit="MM", pointSymbol="0",
+        maximumScreenError=number(POINT_DISTANCE_MM), maximumScreenErrorUnit="MM",
+    )  # fmt: skip
+    return node(
+        "qgis", renderer, node("blendMode", text=str(NORMAL)), node("layerOpacity", text="1"), version=VERSION,
+        styleCategories="Symbology",
+    )  # fmt: skip
 
 
 def _raster_root(style: RasterStyle) -> Element:
@@ -63,8 +86,10 @@ def _renderer(kind: str, *parts: Element, alphaBand: str = "-1", **attributes: s
 def _ramp(style: RampStyle) -> Element:
     low, high = number(style.stops[0].value), number(style.stops[-1].value)
     items = (_entry("item", stop) for stop in style.stops)
+    # The legend is one bar with the values of its ends.
+    legend = node("rampLegendSettings", useContinuousLegend="1", suffix=f" {style.unit}" if style.unit else "")
     shader = node(
-        "colorrampshader", *items, colorRampType="INTERPOLATED", classificationMode="1", clip="0",
+        "colorrampshader", *items, legend, colorRampType="INTERPOLATED", classificationMode="1", clip="0",
         minimumValue=low, maximumValue=high,
     )  # fmt: skip
     return _renderer(
@@ -82,12 +107,11 @@ def _entry(name: str, colour: ValueColour) -> Element:
 
 
 def _stretch(style: StretchStyle) -> Element:
-    # QGIS shows a mask as one more band.
-    alpha = str(len(style.ranges) + 1) if style.has_mask else "-1"
+    alpha = "-1" if style.mask_band is None else str(style.mask_band)
     if len(style.ranges) == 1:
-        stretched = _enhancement("contrastEnhancement", *style.ranges[0])
-        return _renderer("singlebandgray", stretched, alphaBand=alpha, grayBand="1", gradient="BlackToWhite")
-    bands = {f"{name}Band": str(k) for k, name in enumerate(COLOUR_BANDS, 1)}
+        stretched, band = _enhancement("contrastEnhancement", *style.ranges[0]), str(style.bands[0])
+        return _renderer("singlebandgray", stretched, alphaBand=alpha, grayBand=band, gradient="BlackToWhite")
+    bands = {f"{name}Band": str(band) for name, band in zip(COLOUR_BANDS, style.bands, strict=True)}
     parts = (
         _enhancement(f"{name}ContrastEnhancement", *span) for name, span in zip(COLOUR_BANDS, style.ranges, strict=True)
     )
@@ -123,6 +147,8 @@ def _feature_root(style: FeatureStyle) -> Element:
 def _filter(style: FeatureStyle, rule: StyleRule) -> str:
     """The expression of a rule; ELSE is for all features of no other rule."""
     attribute = f'"{style.attribute}"'
+    if rule.value is not None:
+        return f"{attribute} = '{rule.value}'"
     if rule.every is not None:
         share = f"{attribute} / {number(rule.every)}"
         return f"abs({share} - round({share})) < {number(MULTIPLE_TOLERANCE)}"
@@ -136,7 +162,15 @@ def _filter(style: FeatureStyle, rule: StyleRule) -> str:
 
 def _symbol(style: FeatureStyle, rule: StyleRule, name: str) -> Element:
     colour = _rgba(rule)
-    if style.is_line:
+    if style.shape == "polygon":
+        kind, layer = "fill", "SimpleFill"
+        inside = ",".join(str(part) for part in (*rule.colour, round(255 * rule.opacity)))
+        values = {
+            "color": inside, "style": "solid" if rule.opacity else "no", "outline_color": colour,
+            "outline_width": number(rule.size_mm), "outline_width_unit": "MM",
+            "outline_style": "solid" if rule.size_mm else "no", "joinstyle": "round",
+        }  # fmt: skip
+    elif style.shape == "line":
         kind, layer = "line", "SimpleLine"
         values = {
             "line_color": colour, "line_width": number(rule.size_mm), "line_width_unit": "MM", "line_style": "solid",
@@ -159,17 +193,29 @@ def _labels(style: FeatureStyle, rule: StyleRule, number_of_rule: int) -> Elemen
         "text-buffer", bufferDraw="1", bufferSize=number(BUFFER_MM), bufferSizeUnits="MM",
         bufferColor="255,255,255,255", bufferOpacity="1", bufferJoinStyle="128",
     )  # fmt: skip
-    text = f'to_string(round("{style.attribute}", {style.decimals}))'
+    text = f'"{style.text_attribute}"' if style.text_attribute else _rounded(style)
     text_style = node(
         "text-style", buffer, fieldName=text,
-        isExpression="1", fontSize=str(LABEL_POINTS), fontSizeUnit="Point", textColor=_rgba(rule), textOpacity="1",
+        isExpression="1", fontSize=str(LABEL_POINTS), fontSizeUnit="Point", fontWeight=NORMAL_WEIGHT,
+        namedStyle="Regular", textColor=_rgba(rule), textOpacity="1",
     )  # fmt: skip
-    placed = {"placement": str(PLACED_ALONG_LINE), "placementFlags": str(ON_LINE), "maxCurvedCharAngleIn": "25",
-              "maxCurvedCharAngleOut": "-25", "repeatDistance": "60", "repeatDistanceUnits": "MM"}  # fmt: skip
-    placement = node("placement", **(placed if style.is_line else {"placement": "0", "dist": "1", "distUnits": "MM"}))
+    curved = {"maxCurvedCharAngleIn": "25", "maxCurvedCharAngleOut": "-25", "repeatDistance": "60",
+              "repeatDistanceUnits": "MM"}  # fmt: skip
+    along_outline = {"placement": str(PLACED_ALONG_OUTLINE), "placementFlags": str(BELOW_LINE), **curved}
+    placements = {
+        "line": {"placement": str(PLACED_ALONG_LINE), "placementFlags": str(ON_LINE), **curved},
+        # Outlines without an inside may lie above each other, and so may their middles.
+        "polygon": {"placement": str(PLACED_INSIDE)} if rule.opacity else along_outline,
+        "point": {"placement": "0", "dist": "1", "distUnits": "MM"},
+    }
+    placement = node("placement", **placements[style.shape])
     rendering = node("rendering", drawLabels="1", obstacle="1", upsidedownLabels="0", fontMaxPixelSize="10000")
     settings = node("settings", text_style, placement, rendering)
     return node("rule", settings, key=f"label{number_of_rule}", filter=_filter(style, rule))
+
+
+def _rounded(style: FeatureStyle) -> str:
+    return f'to_string(round("{style.attribute}", {style.decimals}))'
 
 
 def _rgba(rule: StyleRule) -> str:

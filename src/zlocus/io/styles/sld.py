@@ -7,8 +7,8 @@ from xml.etree.ElementTree import Element
 from zlocus.io.styles.layer_style import (
     ClassStyle,
     FeatureStyle,
-    LayerStyle,
     RampStyle,
+    RasterStyle,
     StretchStyle,
     StyleRule,
     ValueColour,
@@ -26,10 +26,12 @@ WHITE = (255, 255, 255)
 N_GREYS = 52
 
 
-def sld_of(style: LayerStyle, name: str) -> str:
+def sld_of(style: RasterStyle | FeatureStyle, name: str) -> str:
     """The text of a style file. name : of the layer and of the style."""
     if isinstance(style, FeatureStyle):
-        rules = [_feature_rule(style, rule) for rule in style.rules if rule.every is None or rule.ranges]
+        # QGIS draws the rule for all other features for all of them, so it lies below the others.
+        ordered = sorted(style.rules, key=lambda rule: rule.value is not None or bool(rule.ranges))
+        rules = [_feature_rule(style, rule) for rule in ordered if rule.every is None or rule.ranges]
         options = []
     else:
         rules = [node("Rule", _symbolizer(style))]
@@ -43,7 +45,7 @@ def sld_of(style: LayerStyle, name: str) -> str:
     return document(root)
 
 
-def _symbolizer(style: RampStyle | ClassStyle | StretchStyle) -> Element:
+def _symbolizer(style: RasterStyle) -> Element:
     opacity = node("Opacity", text="1.0")
     if isinstance(style, StretchStyle) and len(style.ranges) > 1:
         return node("RasterSymbolizer", opacity, _channels(style))
@@ -70,19 +72,25 @@ def _entry(colour: ValueColour) -> Element:
 
 def _channels(style: StretchStyle) -> Element:
     channels = []
-    for k, (channel, (low, high)) in enumerate(zip(COLOUR_CHANNELS, style.ranges, strict=True), 1):
+    for channel, band, (low, high) in zip(COLOUR_CHANNELS, style.bands, style.ranges, strict=True):
         limits = {"algorithm": "StretchToMinimumMaximum", "minValue": number(low), "maxValue": number(high)}
         options = (node("VendorOption", text=value, name=key) for key, value in limits.items())
         stretched = node("ContrastEnhancement", node("Normalize", *options))
-        channels.append(node(channel, node("SourceChannelName", text=str(k)), stretched))
+        channels.append(node(channel, node("SourceChannelName", text=str(band)), stretched))
     return node("ChannelSelection", *channels)
 
 
 def _feature_rule(style: FeatureStyle, rule: StyleRule) -> Element:
     size_px = number(round(rule.size_mm * PX_PER_MM, 2))
     colour = hexadecimal(rule.colour)
-    if style.is_line:
-        drawn = node("LineSymbolizer", node("Stroke", _css("stroke", colour), _css("stroke-width", size_px)))
+    stroke = node("Stroke", _css("stroke", colour), _css("stroke-width", size_px))
+    if style.shape == "polygon":
+        inside = node("Fill", _css("fill", colour), _css("fill-opacity", number(rule.opacity)))
+        drawn = node(
+            "PolygonSymbolizer", inside if rule.opacity else None, stroke if rule.size_mm else None
+        )  # fmt: skip
+    elif style.shape == "line":
+        drawn = node("LineSymbolizer", stroke)
     else:
         mark = node("Mark", node("WellKnownName", text="circle"), node("Fill", _css("fill", colour)))
         drawn = node("PointSymbolizer", node("Graphic", mark, node("Size", text=size_px)))
@@ -92,6 +100,8 @@ def _feature_rule(style: FeatureStyle, rule: StyleRule) -> Element:
 
 
 def _filter(style: FeatureStyle, rule: StyleRule) -> Element:
+    if rule.value is not None:
+        return node("ogc:Filter", node("ogc:PropertyIsEqualTo", *_operands(style.attribute, rule.value)))
     ranges = [_range(style.attribute, low, high) for low, high in rule.ranges]
     if not ranges:
         return node("ElseFilter")
@@ -102,17 +112,22 @@ def _range(attribute: str, low: float, high: float) -> Element:
     ends = []
     for kind, end in (("ogc:PropertyIsGreaterThanOrEqualTo", low), ("ogc:PropertyIsLessThan", high)):
         if abs(end) != float("inf"):
-            ends.append(node(kind, node("ogc:PropertyName", text=attribute), node("ogc:Literal", text=number(end))))
+            ends.append(node(kind, *_operands(attribute, number(end))))
     return ends[0] if len(ends) == 1 else node("ogc:And", *ends)
+
+
+def _operands(attribute: str, value: str) -> tuple[Element, Element]:
+    return node("ogc:PropertyName", text=attribute), node("ogc:Literal", text=value)
 
 
 def _label(style: FeatureStyle, rule: StyleRule) -> Element:
     font = node("Font", _css("font-family", "sans-serif"), _css("font-size", str(LABEL_PX)))
     halo = node("Halo", node("Radius", text=str(HALO_PX)), node("Fill", _css("fill", hexadecimal(WHITE))))
-    placement = node("LabelPlacement", node("LinePlacement")) if style.is_line else None
-    options = {"followLine": "true", "repeat": str(REPEAT_PX)} if style.is_line else {}
+    is_line, attribute = style.shape == "line", style.text_attribute or style.attribute
+    placement = node("LabelPlacement", node("LinePlacement")) if is_line else None
+    options = {"followLine": "true", "repeat": str(REPEAT_PX)} if is_line else {}
     return node(
-        "TextSymbolizer", node("Label", node("ogc:PropertyName", text=style.attribute)), font, placement, halo,
+        "TextSymbolizer", node("Label", node("ogc:PropertyName", text=attribute)), font, placement, halo,
         node("Fill", _css("fill", hexadecimal(rule.colour))),
         *(node("VendorOption", text=value, name=key) for key, value in options.items()),
     )  # fmt: skip

@@ -17,7 +17,7 @@ import numpy as np
 
 from zlocus.core.errors import ZlocusError, ZlocusNote, ZlocusWarning
 from zlocus.core.footprints import PairGeometry, ViewGeometry, check_overlap, pair_geometries, view_geometry
-from zlocus.core.options import RunConfig
+from zlocus.core.options import ProductOptions, RunConfig
 from zlocus.core.progress import Progress
 from zlocus.core.requests import DoctorRequest
 from zlocus.core.scene import Scene
@@ -37,6 +37,7 @@ from zlocus.pipeline.required_space import check_room_before_ties
 from zlocus.pipeline.setup import requested_crs, sorted_views
 from zlocus.products.footprints import footprints_picture, write_footprints
 from zlocus.products.ortho_colours import colour_records, colour_sentence
+from zlocus.products.other_styles import write_other_styles
 
 REPORT, FOOTPRINTS, PICTURE = "doctor.json", "footprints.geojson", "footprints.png"
 T = TypeVar("T")
@@ -98,7 +99,7 @@ def run_doctor(request: DoctorRequest, config: RunConfig, progress: Progress) ->
         scene = sorted_views(scene)
         diagnosis = examined(request, config, scene, usable, findings, progress)
     if request.out is not None:
-        write_diagnosis(request.out, diagnosis, scene)
+        write_diagnosis(request.out, diagnosis, scene, config.products)
     return diagnosis
 
 
@@ -198,8 +199,10 @@ def planned(
     return plan
 
 
-def write_diagnosis(out: Path, diagnosis: Diagnosis, scene: Scene | None) -> None:
+def write_diagnosis(out: Path, diagnosis: Diagnosis, scene: Scene | None, options: ProductOptions) -> None:
     """Write doctor.json, and footprints where they are known; footprints of an earlier check are removed.
+
+    options : say whether footprints get a style.
 
     Raises
     ------
@@ -218,4 +221,5 @@ def write_diagnosis(out: Path, diagnosis: Diagnosis, scene: Scene | None) -> Non
             features += [(pair.shared, {"kind": "overlap", **diagnosis.pair_record(pair)}) for pair in diagnosis.pairs]
             write_footprints(out / FOOTPRINTS, features, scene.crs)
             footprints_picture(out / PICTURE, outlines, diagnosis.names)
+        write_other_styles(out, (FOOTPRINTS,), options)
         write_record(out / REPORT, diagnosis.as_dict())
