@@ -8,16 +8,20 @@ from __future__ import annotations
 import os
 
 from qgis.core import (
+    QgsLayerTreeModel,
+    QgsLegendRenderer,
+    QgsLegendSettings,
     QgsMapLayer,
     QgsMapRendererSequentialJob,
     QgsMapSettings,
     QgsPointCloudLayer,
+    QgsProject,
     QgsRasterLayer,
     QgsRectangle,
     QgsVectorLayer,
 )
-from qgis.PyQt.QtCore import QSize
-from qgis.PyQt.QtGui import QColor, QImage
+from qgis.PyQt.QtCore import QSize, Qt
+from qgis.PyQt.QtGui import QColor, QImage, QPainter
 
 SIZE_PX, DPI = 640, 96
 VECTORS, CLOUDS = (".gpkg", ".geojson"), ("ept.json",)
@@ -49,3 +53,21 @@ def picture(layers: list[QgsMapLayer], extent: QgsRectangle, dpi: int = DPI) -> 
     job.start()
     job.waitForFinished()
     return job.renderedImage()
+
+
+def legend(layer: QgsMapLayer) -> tuple[QImage, list[str]]:
+    """The legend of a layer as a picture, and its texts."""
+    project = QgsProject()
+    project.addMapLayer(layer.clone())
+    model = QgsLayerTreeModel(project.layerTreeRoot())
+    renderer = QgsLegendRenderer(model, QgsLegendSettings())
+    size = renderer.minimumSize()
+    image = QImage(int(size.width() * 4) + 8, int(size.height() * 4) + 8, QImage.Format_RGB32)
+    image.fill(Qt.white)
+    image.setDotsPerMeterX(4000)
+    image.setDotsPerMeterY(4000)
+    painter = QPainter(image)
+    renderer.drawLegend(painter)
+    painter.end()
+    node = project.layerTreeRoot().findLayers()[0]
+    return image, [str(part.data(Qt.DisplayRole) or "") for part in model.layerLegendNodes(node)]

@@ -11,9 +11,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import rasterio
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "qgis"))
+sys.path[:0] = [str(ROOT / "qgis"), str(Path(__file__).parent)]
 # Debian's script `qgis_process` gives the program an option that it does not know.
 PROGRAMS = ("qgis_process.bin", "qgis_process")
 PYTHONS = ("/usr/bin/python3",)
@@ -100,6 +101,15 @@ def scene(qgis: Qgis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["-m", "zlocus.synthetic", "-o", folder, "--size", SIZE, "--views", 3, "--seed", SEED]
     subprocess.run([sys.executable, *map(str, words)], check=True, capture_output=True)
     return folder
+
+
+@pytest.fixture(scope="session")
+def middle(scene: Path) -> list[float]:
+    """A box of 24 m in the middle of the scene: xmin, ymin, xmax, ymax in UTM."""
+    with rasterio.open(scene / "truth_dsm.tif") as file:
+        west, south, east, north = file.bounds
+    x, y = (west + east) / 2, (south + north) / 2
+    return [x - 12, y - 12, x + 12, y + 12]
 
 
 @pytest.fixture(scope="session")

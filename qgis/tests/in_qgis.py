@@ -12,19 +12,14 @@ import time
 
 from qgis.core import (
     QgsApplication,
-    QgsLayerTreeModel,
-    QgsLegendRenderer,
-    QgsLegendSettings,
     QgsProcessingContext,
     QgsProcessingException,
     QgsProcessingFeedback,
     QgsProject,
 )
-from qgis.PyQt.QtCore import Qt
-from qgis.PyQt.QtGui import QImage, QPainter
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-from drawing import CLOUDS, VECTORS, layer_of, picture
+from drawing import CLOUDS, VECTORS, layer_of, legend, picture
 
 LONG_S = 60.0
 
@@ -43,24 +38,6 @@ def begin():
     plugin = zlocus_processing.classFactory(None)
     plugin.initProcessing()
     return application, plugin
-
-
-def legend(layer):
-    """The legend of a layer as a picture, and its texts."""
-    project = QgsProject()
-    project.addMapLayer(layer.clone())
-    model = QgsLayerTreeModel(project.layerTreeRoot())
-    renderer = QgsLegendRenderer(model, QgsLegendSettings())
-    size = renderer.minimumSize()
-    image = QImage(int(size.width() * 4) + 8, int(size.height() * 4) + 8, QImage.Format_RGB32)
-    image.fill(Qt.white)
-    image.setDotsPerMeterX(4000)
-    image.setDotsPerMeterY(4000)
-    painter = QPainter(image)
-    renderer.drawLegend(painter)
-    painter.end()
-    node = project.layerTreeRoot().findLayers()[0]
-    return image, [str(part.data(Qt.DisplayRole) or "") for part in model.layerLegendNodes(node)]
 
 
 def n_colours(image):

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import rasterio
 from rasterio.warp import transform_bounds
 
 
@@ -34,15 +33,6 @@ def test_the_same_values_find_the_surface_finished(qgis, images, surface):
     found = qgis.run("dsm", INPUT=images, RESOLUTION=0.6, MAPS="0,1", OUTPUT=surface)
     assert found["DSM"] == str(surface / "dsm.tif")
     assert 0.5 < found["COVERAGE"] <= 1.0
-
-
-@pytest.fixture(scope="module")
-def middle(scene):
-    """A box of 24 m in the middle of the scene: xmin, ymin, xmax, ymax in UTM."""
-    with rasterio.open(scene / "truth_dsm.tif") as file:
-        west, south, east, north = file.bounds
-    x, y = (west + east) / 2, (south + north) / 2
-    return [x - 12, y - 12, x + 12, y + 12]
 
 
 def request_of(folder):

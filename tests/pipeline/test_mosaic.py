@@ -105,6 +105,8 @@ def test_files_and_record(joined):
     rasters = {"dsm.tif", "sigma.tif", "quality.tif", "source.tif", "seams.tif"}
     styles = {name for raster in rasters for name in style_files(raster)}
     assert names == {*rasters, *styles, "seams.png", "run.json"}
+    with rasterio.open(out / "source.tif") as file:
+        assert file.tags(1)["RUNS"] == "; ".join(f"{k} {folder.name}" for k, folder in enumerate(runs.folders, 1))
     run = record(out)
     assert run["command"] == "zlocus mosaic"
     assert [each["path"] for each in run["inputs"]][:2] == [str(runs.folders[0] / n) for n in ("dsm.tif", "sigma.tif")]

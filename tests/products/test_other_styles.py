@@ -13,7 +13,7 @@ from odc.geo.geobox import GeoBox
 from zlocus.core.options import ProductOptions
 from zlocus.io.rasters import RasterBands, RasterSink, write_cog
 from zlocus.matching.quality import Quality
-from zlocus.products.number_names import RUNS, number_tag, numbered_names
+from zlocus.products.number_names import RUNS, number_tag, numbered_names, short_names
 from zlocus.products.other_styles import MAX_NUMBERS, NUMBER_COLOURS, write_other_styles
 from zlocus.products.point_cloud import write_map
 
@@ -68,6 +68,8 @@ def test_runs_of_a_mosaic_have_their_names(tmp_path, n):
 def test_names_of_numbers():
     assert numbered_names(number_tag(["a b", "2020; x"])) == {1: "a b", 2: "2020; x"}
     assert numbered_names("") == {}
+    assert short_names(["/data/may/north", "/data/may/south/dsm.tif=0.3"]) == ["north", "south/dsm.tif=0.3"]
+    assert short_names(["north", "north/joined"]) == ["north", "north/joined"]
 
 
 def test_images_of_a_cloud_have_the_styles_of_a_surface(tmp_path):

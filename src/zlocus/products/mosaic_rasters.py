@@ -19,7 +19,7 @@ from zlocus.io.surface_cells import PlacedSurface, SurfaceCells, read_cells
 from zlocus.io.surface_inputs import DSM, ORTHO, QUALITY, SIGMA, VIEWS, WATER
 from zlocus.matching.quality import EMPTY, Quality
 from zlocus.products.blending import BlendedCells, RunRelations, SeamKind, blended, halo_cells
-from zlocus.products.number_names import RUNS, number_tag
+from zlocus.products.number_names import RUNS, number_tag, short_names
 from zlocus.products.rasters import COLOURS, flag_tags
 from zlocus.products.run_offsets import PairSample, sampled_pairs
 
@@ -117,7 +117,7 @@ class MosaicRasters:
     """Writer of the rasters of a mosaic. The files appear when the context ends without an error.
 
     spatial_geobox : grid with the vertical datum, for the heights; geobox : without it, for the others; description :
-    of the heights; has : which of views.tif and water.tif are made; ortho_bands : see `MosaicJob`; runs : their names.
+    of the heights; has : which of views.tif and water.tif are made; ortho_bands : see `MosaicJob`; runs : their paths.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class MosaicRasters:
             VIEWS: RasterBands("uint8", 0, ("images used by the run in source.tif",)),
             WATER: RasterBands("uint8", None, ("water surface",)),
             SOURCE: RasterBands(
-                "uint16", 0, ("number of the run that was chosen, from 1",), tags={RUNS: number_tag(runs)}
+                "uint16", 0, ("number of the run that was chosen, from 1",), tags={RUNS: number_tag(short_names(runs))}
             ),
             SEAMS: RasterBands("uint8", 0, ("how the height was made",), tags=_seam_tags()),
         }
