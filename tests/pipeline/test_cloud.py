@@ -262,11 +262,12 @@ def test_one_reference_is_kept_unconfirmed(images, tmp_path):
 def test_copc_is_made_of_a_finished_cloud(of_step, images, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(of_step.out, out)
+    (out / "fore_quality.sld").unlink()
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     asked = {"crs": "EPSG:32632", "heights": HEIGHTS}
     assert run(images("step").inputs, out, copc=True, **asked).was_finished
     changed = {path.name for path in out.iterdir() if before.get(path.name) != path.stat().st_mtime_ns}
-    assert changed == {"cloud.copc.laz", "cloud.copc.qml", "finished.json"}
+    assert changed == {"cloud.copc.laz", "cloud.copc.qml", "fore_quality.sld", "finished.json"}
     checked_nodes(out / "cloud.copc.laz")
     check_laz(out / "cloud.copc.laz")
     one, other = (laspy.read(out / name).points.array for name in ("cloud.laz", "cloud.copc.laz"))

@@ -11,6 +11,8 @@ import pytest
 import rasterio
 from affine import Affine
 from odc.geo.geobox import GeoBox
+from pyproj import CRS
+from shapely import box
 
 from zlocus.core.options import ProductOptions
 from zlocus.core.progress import SilentProgress
@@ -18,6 +20,7 @@ from zlocus.io.rasters import write_cog
 from zlocus.io.styles.file_names import OF_SURFACE, REASONS, style_files
 from zlocus.matching.quality import Quality
 from zlocus.products.derived import write_derived
+from zlocus.products.footprints import write_footprints
 from zlocus.products.report.maps import FLAG_GROUPS, NO_FLAG, groups_of
 from zlocus.products.stac_item import write_item
 from zlocus.products.styles import MAX_INDEX_CONTOURS, missing_styles, write_styles
@@ -55,7 +58,10 @@ def values(root, tag):
 
 
 def test_every_product_has_a_style(surface):
-    write_derived(surface, ("hillshade", "contours"), ProductOptions(), SilentProgress())
+    write_derived(surface, ("hillshade", "contours", "laz"), ProductOptions(), SilentProgress())
+    outline = box(500000, 3999940, 500080, 4000000)
+    features = [(outline, {"kind": kind, "name": "a"}) for kind in ("image", "overlap")]
+    write_footprints(surface / "footprints.geojson", features, CRS.from_epsg(32632))
     products = sorted(name for name in os.listdir(surface) if name in OF_SURFACE)
     assert missing_styles(surface, ProductOptions()) != ()
     write_styles(surface, ProductOptions())
