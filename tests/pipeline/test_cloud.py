@@ -184,7 +184,7 @@ def test_run_json_holds_what_was_done(of_step):
     record = json.loads((of_step.out / "run.json").read_text())
     assert record["points"] == of_step.n_points
     assert set(record["images"]) == set(LOOKS)
-    assert [s["name"] for s in record["stages"]] == ["open", "orient", "setup", "match", "write"]
+    assert [s["name"] for s in record["stages"]] == ["open", "orient", "setup", "match", "write", "styles"]
     assert len(record["inputs"]) == 3
     assert sum(v["points"] for v in record["images"].values()) == of_step.n_points
 

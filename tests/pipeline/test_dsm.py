@@ -249,7 +249,7 @@ def test_another_run_leaves_no_map_of_the_one_before(images, tmp_path):
     out = run(images("plane"), tmp_path / "out", bounds=PART, products=("dtm", "laz")).out
     assert {"dtm.tif", "surface.laz", "item.json"} <= {path.name for path in out.iterdir()}
     run(images("plane"), out, bounds=PART, products=(), overwrite=True, report=True)
-    assert {path.name for path in out.iterdir()} == styles_of((*PRODUCTS, "ties.gpkg")) | {
+    assert {path.name for path in out.iterdir()} == styles_of((*PRODUCTS, *REPORT_FILES, "ties.gpkg")) | {
         *PRODUCTS,
         *REPORT_FILES,
         "ties.gpkg",

@@ -250,7 +250,9 @@ def test_products_that_are_asked_for_later_are_added(images, out, no_matching, s
     with pytest.raises(OutputError, match="contours_of"):
         asked(images, out, config, products=("dtm",))
     assert asked(images, out, products=("dtm", "laz")).was_finished
-    assert changed(before, out) == {"dtm.tif", "dtm.qml", "dtm.sld", "surface.laz", "item.json", FINISHED}
+    assert changed(before, out) == {
+        "dtm.tif", "dtm.qml", "dtm.sld", "surface.laz", "surface.qml", "item.json", FINISHED,
+    }  # fmt: skip
     assert "Made, for it was not there: dtm.tif, surface.laz." in said.getvalue()
     assert "dtm.tif" in (out / "item.json").read_text()
     before = state(out)
@@ -272,7 +274,9 @@ def test_a_page_that_is_asked_for_later_is_added_with_what_it_shows(images, fini
     assert asked(images, out, report=False).was_finished
     assert changed(before, out) == set()
     assert asked(images, out).was_finished
-    assert changed(before, out) == {"footprints.geojson", "curves.json", "report.html", "item.json", FINISHED}
+    assert changed(before, out) == {
+        "footprints.geojson", "footprints.qml", "footprints.sld", "curves.json", "report.html", "item.json", FINISHED,
+    }  # fmt: skip
     assert (out / "footprints.geojson").read_bytes() == (finished / "footprints.geojson").read_bytes()
     cells, others = (
         [{name: cell.get(name) for name in ("row", "col", "height_m", "svg")} for cell in json.loads(text)["cells"]]
