@@ -182,6 +182,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "LineProgress": ("progress",),
     "NotebookProgress": ("progress",),
     "LineScanCamera": ("camera",),
+    "LocationGridCamera": ("camera",),
     "LineScanModel": ("sensor",),
     "LineScanner": ("camera",),
     "OpenedCamera": ("camera",),

@@ -23,7 +23,8 @@ def all_kernels():
     found = {}
     packages = (zlocus.matching.kernels, zlocus.orientation.kernels)
     names = [f"{package.__name__}.{m.name}" for package in packages for m in pkgutil.iter_modules(package.__path__)]
-    single = ["products.shade_kernel", "sensors.frame_kernel", "sensors.rpc_kernel", "sensors.straighten_kernel"]
+    sensors = [f"sensors.{name}_kernel" for name in ("frame", "location_grid", "rpc", "straighten")]
+    single = ["products.shade_kernel", *sensors]
     for name_of_module in [*names, *(f"zlocus.{name}" for name in single)]:
         loaded = importlib.import_module(name_of_module)
         source = inspect.getsource(loaded)

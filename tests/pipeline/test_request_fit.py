@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from pyproj import Transformer
 
+from location_grids import grid_of
 from zlocus.core.errors import ConfigError, CoverageError, GeometryError
 from zlocus.core.footprints import shared_ground
 from zlocus.core.options import RunConfig
@@ -15,6 +18,8 @@ from zlocus.pipeline import setup
 from zlocus.pipeline.height_range import possible_heights
 from zlocus.pipeline.request_fit import check_bounds_in_metres, check_heights_of_cameras
 from zlocus.pipeline.setup import open_inputs, orient_views, set_up_run
+from zlocus.sensors.correction import ShiftedModel
+from zlocus.sensors.location_grid import LocationGridModel
 
 # A rendered town in UTM zone 32, about 9.00 degrees east and 47.00 degrees north.
 VIEWS = ("img_n1.tif", "img_f1.tif")
@@ -56,6 +61,21 @@ def test_heights_beyond_the_cameras_are_refused(scene, images):
             check_heights_of_cameras(wrong, scene)
     with pytest.raises(GeometryError, match="1000 to 2000 m, lie outside"):
         open_inputs(SetupRequest(images, heights=(1000.0, 2000.0)), SilentProgress())
+
+
+def test_heights_beyond_a_location_grid_are_refused(scene):
+    """A grid is extended by the distance of its outermost heights, and maps nothing beyond."""
+    first, second = scene.views
+    (rows, cols), (low, high) = first.image.shape, first.sensor.height_bounds()
+    heights, step = (low, low + 10.0, high), (cols - 1.0, rows - 1.0)
+    location_grid = grid_of(first.sensor, scene.crs, heights, (0.0, 0.0), step, (2, 2))
+    sensor = ShiftedModel(LocationGridModel(location_grid, scene.crs), 1.0, 0.0)
+    tabulated = replace(scene, views=(second, replace(first, sensor=sensor)))
+    check_heights_of_cameras((low - 9.0, high + 1.0), tabulated)
+    for wrong in ((low - 11.0, high), (low, 2 * high - low)):
+        with pytest.raises(GeometryError, match=rf"reach beyond the location grid of {first.name}, which maps"):
+            check_heights_of_cameras(wrong, tabulated)
+        check_heights_of_cameras(wrong, scene)
 
 
 def test_heights_without_ground_are_blamed_where_ties_lie_elsewhere(images, monkeypatch):

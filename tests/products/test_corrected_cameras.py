@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from flights import COLUMNS, FOCAL_MM, INTERVAL_S, ROWS, Flight, focal_line, on_earth
+from location_grids import grid_of, written
 from rendered_scenes import UTM
 from rpc_fixtures import write_image
 from zlocus.core.errors import ConfigError
@@ -65,6 +66,42 @@ def test_affine_rpcs_are_fitted_and_say_how_well(images, tmp_path):
     )  # fmt: skip
     assert_same(corrected, again, (20.0, 90.0), FITTED_PX)
     assert 0.0 < record["fore"]["rpc_fit_max_px"] < FITTED_PX
+
+
+def location_grid_scene(scene, folder):
+    """Scene file of the first two views, with a location grid of each sensor in a folder beside it."""
+    (folder / "grids").mkdir()
+    views = []
+    for view in scene.views[:2]:
+        rows, cols = view.image.shape
+        step = ((cols + 20.0) / 4, (rows + 20.0) / 4)
+        location_grid = grid_of(view.sensor, scene.crs, (-20.0, 30.0, 80.0, 130.0), (-10.0, -10.0), step, (5, 5))
+        written(folder / "grids" / f"{view.name}.tif", location_grid)
+        camera = {"kind": "location_grid", "file": f"grids/{view.name}.tif", "shift": [0.25, 0.5]}
+        views.append({"name": view.name, "image": str(view.path), "camera": camera})
+    file = folder / "scene.yaml"
+    file.write_text(yaml.safe_dump({"schema": 1, "frame": {"crs": "EPSG:32632"}, "views": views}))
+    return file
+
+
+def test_shifted_location_grids_are_exact(images, tmp_path):
+    inputs = [location_grid_scene(open_scene(images("plane").inputs), tmp_path)]
+    check_cameras_can_be_written(inputs)
+    scene = open_scene(inputs)
+    corrected, again, record = rewritten(scene, tmp_path, inputs, lambda sensor: ShiftedModel(sensor, 1.25, -3.5))
+    assert_same(corrected, again, (20.0, 90.0))
+    file = "../../grids/nadir.tif"
+    assert record["nadir"] == {"kind": "location_grid", "file": file, "first_pixel": [0.0, 0.0], "shift": [1.5, -3.0]}
+
+
+def test_location_grids_with_affine_corrections_become_rpcs(images, tmp_path):
+    inputs = [location_grid_scene(open_scene(images("plane").inputs), tmp_path)]
+    corrected, again, record = rewritten(
+        open_scene(inputs), tmp_path, inputs,
+        lambda sensor: AffinelyShiftedModel(sensor, (1.0, 2e-3, -3e-3), (-2.0, 1e-3, 4e-3)),
+    )  # fmt: skip
+    assert_same(corrected, again, (20.0, 90.0), FITTED_PX)
+    assert record["nadir"]["kind"] == "rpc"
 
 
 FRAME_CAMERA = {

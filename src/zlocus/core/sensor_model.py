@@ -54,6 +54,15 @@ class Scanning(Protocol):
         ...
 
 
+@runtime_checkable
+class Tabulated(Protocol):
+    """A sensor model that is a table of some heights: unlike a formula it ends a little outside of them."""
+
+    def height_limits(self) -> tuple[float, float]:
+        """Lowest and highest ellipsoidal height (m) at which it maps points; below and above them all are NaN."""
+        ...
+
+
 def bare(sensor: SensorModel) -> SensorModel:
     """The sensor model without its corrections."""
     while hasattr(sensor, "base_sensor"):

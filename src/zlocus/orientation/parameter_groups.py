@@ -14,6 +14,7 @@ from zlocus.core.sensor_model import FloatArray, SensorModel
 from zlocus.sensors.correction import AffinelyShiftedModel, ShiftedModel
 from zlocus.sensors.frame import FrameModel
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
+from zlocus.sensors.location_grid import LocationGridModel
 from zlocus.sensors.rpc import RpcModel
 from zlocus.sensors.trajectory import Drift
 
@@ -63,9 +64,10 @@ class ParameterGroup:
 
 
 def kind_of(sensor: SensorModel) -> str:
-    """Kind of a sensor in reports: frame, linescan, rpc or other; the last two are corrected in their images."""
+    """Kind of a sensor in reports: frame or linescan, or one that is corrected in its image: rpc, location_grid or
+    other."""
     bare = uncorrected(sensor)
-    kinds = ((FrameModel, "frame"), (Scanner, "linescan"), (RpcModel, "rpc"))
+    kinds = ((FrameModel, "frame"), (Scanner, "linescan"), (RpcModel, "rpc"), (LocationGridModel, "location_grid"))
     return next((kind for model, kind in kinds if isinstance(bare, model)), "other")
 
 

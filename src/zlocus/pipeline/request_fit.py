@@ -10,6 +10,7 @@ from pyproj.exceptions import ProjError
 from zlocus.core.errors import ConfigError, GeometryError
 from zlocus.core.footprints import Bounds, views_near
 from zlocus.core.scene import Scene, is_local
+from zlocus.core.sensor_model import Tabulated, bare
 from zlocus.pipeline.height_range import possible_heights
 
 LARGEST_LONGITUDE, LARGEST_LATITUDE = 360.0, 90.0
@@ -43,19 +44,30 @@ def check_bounds_in_metres(bounds: Bounds | None, scene: Scene) -> None:
 
 
 def check_heights_of_cameras(heights: tuple[float, float] | None, scene: Scene) -> None:
-    """Refuse heights (m, ellipsoidal) at which the cameras of all images mean nothing.
+    """Refuse heights (m, ellipsoidal) at which the cameras of all images mean nothing, or one of them maps nothing.
 
     Raises
     ------
     GeometryError
-        They lie outside the heights of all cameras that have such limits.
+        They lie outside the heights of all cameras that have such limits, or reach beyond a table.
     """
-    limits = [found for view in scene.views if (found := view.sensor.height_bounds()) is not None]
-    if heights is None or not limits or len(limits) < len(scene.views):
+    if heights is None:
         return
-    low, high = min(limit[0] for limit in limits), max(limit[1] for limit in limits)
-    if heights[0] > high or heights[1] < low:
-        raise GeometryError(
-            f"The heights asked for, {heights[0]:.6g} to {heights[1]:.6g} m, lie outside those of the images' cameras, "
-            f"{low:.6g} to {high:.6g} m. Give --heights that contain the ground, or leave it out."
-        )
+    limits = [found for view in scene.views if (found := view.sensor.height_bounds()) is not None]
+    asked = f"The heights asked for, {heights[0]:.6g} to {heights[1]:.6g} m,"
+    if len(limits) == len(scene.views):
+        low, high = min(limit[0] for limit in limits), max(limit[1] for limit in limits)
+        if heights[0] > high or heights[1] < low:
+            raise GeometryError(
+                f"{asked} lie outside those of the images' cameras, {low:.6g} to {high:.6g} m. Give --heights that "
+                "contain the ground, or leave it out."
+            )
+    for view in scene.views:
+        sensor = bare(view.sensor)
+        if isinstance(sensor, Tabulated):
+            low, high = sensor.height_limits()
+            if heights[0] < low or heights[1] > high:
+                raise GeometryError(
+                    f"{asked} reach beyond the location grid of {view.name}, which maps {low:.6g} to {high:.6g} m. "
+                    "Give --heights inside of these, or a grid of more heights."
+                )

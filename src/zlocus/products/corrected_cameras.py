@@ -20,6 +20,7 @@ from zlocus.io.cameras.camera_kinds import RpcCamera
 from zlocus.io.cameras.frame_camera import FrameCamera, distortion_entry, rolling_shutter_entry
 from zlocus.io.cameras.linescan import LineScanCamera
 from zlocus.io.cameras.linescan_files import write_trajectory
+from zlocus.io.cameras.location_grid import LocationGridCamera
 from zlocus.io.cameras.rpc_text import write_rpc_txt
 from zlocus.io.colour_entry import ColourEntry
 from zlocus.io.images import RasterImage
@@ -31,6 +32,7 @@ from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.earth_frame import EarthSpace
 from zlocus.sensors.frame import FrameModel, as_row, as_rows
 from zlocus.sensors.linescan import LineScanModel, RectifiedModel
+from zlocus.sensors.location_grid import LocationGridModel
 from zlocus.sensors.rpc import RpcCoefficients, RpcModel
 from zlocus.sensors.rpc_fit import fit_rpc
 
@@ -131,13 +133,14 @@ def check_cameras_can_be_written(inputs: Sequence[Path]) -> None:
     Raises
     ------
     ConfigError
-        A camera is neither an RPC nor a frame camera nor a line scanner.
+        A camera is neither an RPC nor a frame camera nor a line scanner nor a location grid.
     """
     for name, (camera, _) in given_cameras(inputs).items():
-        if not isinstance(camera, RpcCamera | FrameCamera | LineScanCamera):
+        if not isinstance(camera, RpcCamera | FrameCamera | LineScanCamera | LocationGridCamera):
             raise ConfigError(
                 f"The camera of {name} in {inputs[0]} is of the kind {_kind_of(camera)}, and corrected "
-                "cameras are written for rpc, frame and linescan only. Use zlocus dsm, which corrects it in the run."
+                "cameras are written for rpc, frame, linescan and location_grid only. Use zlocus dsm, which corrects "
+                "it in the run."
             )
 
 
@@ -147,6 +150,10 @@ def write_camera(out: Path, name: str, camera: CameraEntry, folder: Path, view: 
         return WrittenCamera(frame_entry(camera, view.sensor, scene))
     if isinstance(camera, LineScanCamera):
         return WrittenCamera(write_scanner(out, name, camera, folder, view, scene))
+    if isinstance(camera, LocationGridCamera):
+        shifted = shifted_entry(out, camera, folder, view.sensor)
+        if shifted is not None:
+            return WrittenCamera(shifted)
     rpc, fit_px = rpc_of(view, scene)
     file = f"{FOLDER}/{name}_RPC.TXT"
     write_rpc_txt(out / file, rpc)
@@ -158,16 +165,31 @@ def rpc_of(view: View, scene: Scene) -> tuple[RpcCoefficients, float | None]:
 
     A shifted RPC is exact, and the error is None. Other corrections are fitted over the image and the RPC's heights.
     """
-    sensor, shift = view.sensor, np.zeros(2)
-    while isinstance(sensor, ShiftedModel):
-        shift += [sensor.column, sensor.row]
-        sensor = sensor.base_sensor
+    sensor, (column, row) = without_shifts(view.sensor)
     if isinstance(sensor, RpcModel):
-        return sensor.rpc.moved(column=float(shift[0]), row=float(shift[1])), None
+        return sensor.rpc.moved(column=column, row=row), None
     heights = view.sensor.height_bounds()
-    assert heights is not None, "an RPC knows its heights"
+    assert heights is not None, "an RPC and a location grid know their heights"
     fit = fit_rpc(view.sensor, view.image.shape, scene.crs, heights)
     return fit.rpc, fit.max_error_px
+
+
+def without_shifts(sensor: SensorModel) -> tuple[SensorModel, tuple[float, float]]:
+    """The sensor model under the shifts that are laid over it, and their sum (column, row), px."""
+    column = row = 0.0
+    while isinstance(sensor, ShiftedModel):
+        column, row, sensor = column + sensor.column, row + sensor.row, sensor.base_sensor
+    return sensor, (column, row)
+
+
+def shifted_entry(
+    out: Path, camera: LocationGridCamera, folder: Path, sensor: SensorModel
+) -> LocationGridCamera | None:
+    """Entry of a location grid with its shift, which is exact; None where more than a shift was corrected."""
+    bare, (column, row) = without_shifts(sensor)
+    if not isinstance(bare, LocationGridModel):
+        return None
+    return camera.model_copy(update={"file": relative(folder / camera.file, out), "shift": (column, row)})
 
 
 def frame_entry(camera: FrameCamera, sensor: SensorModel, scene: Scene) -> FrameCamera:

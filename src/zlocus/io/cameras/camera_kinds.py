@@ -13,6 +13,7 @@ from zlocus.core.sensor_model import SensorModel
 from zlocus.io.cameras.camera_entry import CameraEntry
 from zlocus.io.cameras.frame_camera import FrameCamera
 from zlocus.io.cameras.linescan import LineScanCamera
+from zlocus.io.cameras.location_grid import LocationGridCamera
 from zlocus.io.cameras.rpc import find_sidecar, read_rpc
 from zlocus.io.schema import FiniteNumber
 from zlocus.sensors.correction import ShiftedModel
@@ -57,4 +58,6 @@ class RpcCamera(CameraEntry):
         return RpcSource(read_rpc(image, file), self.shift, () if file is None else (file,))
 
 
-CAMERA_KINDS: dict[str, type[CameraEntry]] = {"rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera}
+CAMERA_KINDS: dict[str, type[CameraEntry]] = {
+    "rpc": RpcCamera, "frame": FrameCamera, "linescan": LineScanCamera, "location_grid": LocationGridCamera,
+}  # fmt: skip
