@@ -59,6 +59,7 @@ ROWS: dict[str, Row] = {
     "hardness": Row("rows.realistic:hardness", is_recorded=False),
     "calanques": Row("rows.satellite:calanques"),
     "ventoux": Row("rows.satellite:ventoux"),
+    "ventoux-grid": Row("rows.location_grids:ventoux_grid"),
     "datum": Row("rows.satellite:datum"),
     "dmc": Row("rows.photographs:dmc"),
     "tuniu": Row("rows.photographs:tuniu"),
