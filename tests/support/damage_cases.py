@@ -29,6 +29,7 @@ from csm_states import state
 from flights import FOCAL_MM, INTERVAL_S
 from geoids import write_geoid
 from grid_input_files import write_polygons, write_raster
+from location_grids import grid_of, written
 from rpc_fixtures import dimap_dim, dimap_rpc, rpb, rpc_txt, satellite_rpc, write_image
 from zlocus.core.options import RunConfig
 from zlocus.core.requests import ImportRequest
@@ -36,6 +37,7 @@ from zlocus.evaluation.heights import read_heights
 from zlocus.evaluation.truth import read_classes
 from zlocus.io.cameras.csm import MODEL, read_csm
 from zlocus.io.cameras.linescan_files import read_calibration, read_times, read_trajectory
+from zlocus.io.cameras.location_grid import LocationGridCamera
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.io.config import config_as_dict, read_config, write_config
 from zlocus.io.control_points import read_control
@@ -45,6 +47,7 @@ from zlocus.io.images import open_image
 from zlocus.io.importers.scene import import_scene
 from zlocus.io.run_record import read_record
 from zlocus.io.scene_file import open_scene, read_scene_file
+from zlocus.sensors.rpc import RpcModel
 
 RPC = satellite_rpc()
 PIXELS = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
@@ -308,6 +311,20 @@ def _write_posts(folder: Path) -> Path:
     return write_geoid(folder / "geoid.tif", posts, from_origin(4.5, 44.5, 0.25, 0.25), compress="deflate")
 
 
+def _write_location_grid(folder: Path) -> Path:
+    write_image(folder / "img.tif", PIXELS)
+    utm = CRS.from_epsg(32631)
+    location_grid = grid_of(RpcModel(RPC, utm), utm, (0.0, 400.0, 900.0), (-1.0, -1.0), (35.0, 13.0), (5, 3))
+    return written(folder / "grid.tif", location_grid, "LG_", compress="deflate")
+
+
+def _read_location_grid(path: Path) -> Leaves:
+    camera = LocationGridCamera(file=path.name)
+    sensor = camera.read(path.parent, path.with_name("img.tif")).sensor(CRS.from_epsg(32631))
+    xy = np.array([[0.0, 0.0], [60.0, 40.0]])
+    return leaves(sensor.ground_from_image(xy, np.array([100.0, 700.0])))
+
+
 def _write_gtx(folder: Path) -> Path:
     """Posts of a GTX file, the first in the south-west. Source: NOAA, "VDatum GTX file format"."""
     posts = np.linspace(40.0, 50.0, 13 * 9, dtype=">f4").reshape(13, 9)
@@ -409,6 +426,7 @@ CASES: dict[str, Case] = {
     "dem": Case(_write_dem, lambda path: {("z",): read_dem(path, GRID).tobytes()}, text=False),
     "like": Case(_write_dem, lambda path: {("grid",): str(read_geobox(path))}, text=False),
     "geoid-tif": Case(_write_posts, _read_geoid, text=False),
+    "location-grid": Case(_write_location_grid, _read_location_grid, text=False),
     "geoid-gtx": Case(_write_gtx, _read_geoid, text=False),
     "classes": Case(_write_classes, _read_classes, text=False),
     "image-colours": Case(_write_colours, _read_colours, text=False),

@@ -25,15 +25,15 @@ def grid_of(sensor, crs, heights, first_node, step, shape):
     return LocationGrid(np.array(heights, float), xy, first_node, step, WGS84)
 
 
-def written(path, location_grid, prefix="", status=None, leave_out=(), bands=None, **changed):
+def written(path, location_grid, prefix="", status=None, leave_out=(), compress=None, **changed):
     """The GeoTIFF of a location grid, as shareloc has it.
 
-    prefix : of the tags, "LG_" as libGEO writes them; status : (h, r, c) of the nodes; leave_out : tags; bands : values
-    in place of the grid's; changed : tags with other values.
+    prefix : of the tags, "LG_" as libGEO writes them; status : (h, r, c) of the nodes; leave_out : tags; compress : of
+    the file; changed : tags with other values.
     """
     fields = ("lon", "lat") if status is None else ("lon", "lat", "status")
     stacks = [location_grid.xy[..., 0], location_grid.xy[..., 1], *([] if status is None else [status])]
-    values = np.stack(stacks, axis=1).reshape(-1, *location_grid.xy.shape[1:3]) if bands is None else bands
+    values = np.stack(stacks, axis=1).reshape(-1, *location_grid.xy.shape[1:3])
     tags = {"REF": "EPSG:4326"}
     for band in range(len(values)):
         tags[f"ALTITUDE_B{band}"] = f"{location_grid.heights[band // len(fields)]:g}"
@@ -43,7 +43,7 @@ def written(path, location_grid, prefix="", status=None, leave_out=(), bands=Non
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(
-            path, "w", driver="GTiff", dtype=values.dtype, count=len(values), height=values.shape[1],
+            path, "w", driver="GTiff", compress=compress, dtype=values.dtype, count=len(values), height=values.shape[1],
             width=values.shape[2], transform=Affine(across, 0, column + 0.5, 0, down, row + 0.5),
         ) as file:  # fmt: skip
             file.write(values)
