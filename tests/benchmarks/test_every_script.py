@@ -82,6 +82,7 @@ RUN_BY = {
     "rows/demo.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/fresh.py": "test_seeds.py::test_the_figures_of_a_seed_are_those_of_its_surface",
     "rows/choice_of_images.py": "test_many_images.py::test_the_default_is_compared_with_the_best_of_the_others",
+    "rows/location_grids.py": "test_location_grids_row.py::test_distances_of_cameras_that_differ_by_a_shift",
     "rows/many_images.py": "test_many_images.py::test_false_heights_on_ground_away_from_buildings_are_counted",
     "rows/methods.py": "test_acceptance.py::test_a_row_of_the_acceptance_table",
     "rows/ortho_images.py": "test_ortho_images_row.py::test_a_displaced_ortho_image_is_judged",
