@@ -18,9 +18,12 @@ from rasterio.transform import from_origin
 from scipy.ndimage import distance_transform_edt
 
 from zlocus.core.scene import View
+from zlocus.sensors.frame import FrameModel
 
 STEP_M = 0.5
 MARGIN_M = 25.0
+# The parallax is that of a point which lies this far above the plane.
+RISE_M = 10.0
 
 
 class Area(Protocol):
@@ -62,9 +65,9 @@ def parallax(area: Area, views: Sequence[View], shifts: Sequence[np.ndarray], z:
     point = np.array([[(west + east) / 2, (south + north) / 2]])
     on_plane = []
     for view, shift in zip(views, shifts, strict=True):
-        seen = to_image(view, shift, point, z + 10.0)
+        seen = to_image(view, shift, point, z + RISE_M)
         on_plane.append(view.sensor.ground_from_image(seen - shift, np.array([z]))[0, :2])
-    return np.asarray((on_plane[0] - on_plane[1]) / 10.0)
+    return np.asarray((on_plane[0] - on_plane[1]) / RISE_M)
 
 
 def rectified(area: Area, moved: np.ndarray) -> Rectified:
@@ -77,6 +80,23 @@ def rectified(area: Area, moved: np.ndarray) -> Rectified:
     low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
     cols, rows = (int(n) + 1 for n in (high - low) / STEP_M)
     return Rectified(low @ np.stack([along, across]), along, across, (rows, cols))
+
+
+def shown(views: Sequence[View], shifts: Sequence[np.ndarray], plane: Rectified, z: float) -> np.ndarray:
+    """Which cells (r, c) of the plane lie inside all views."""
+    row, col = np.mgrid[: plane.shape[0], : plane.shape[1]]
+    xy, found = plane.ground(row.ravel(), col.ravel()), np.ones(row.size, bool)
+    for view, shift in zip(views, shifts, strict=True):
+        seen = to_image(view, shift, xy, z)
+        # Far outside, lenses have no image positions: these are NaN, and not inside.
+        found &= ((seen >= 0) & (seen <= np.array(view.image.shape[::-1]) - 1)).all(axis=1)
+    return found.reshape(plane.shape)
+
+
+def cameras_above(views: Sequence[View], z: float) -> float:
+    """Mean height of frame cameras above a plane, m; infinity for satellites, whose parallax is linear in height."""
+    stations = [view.sensor.station_height() for view in views if isinstance(view.sensor, FrameModel)]
+    return float(np.mean(stations)) - z if stations else np.inf
 
 
 def on_plane(view: View, shift: np.ndarray, plane: Rectified, z: float) -> np.ndarray:
@@ -101,14 +121,24 @@ def disparity_range(area_heights: tuple[float, float], moved: np.ndarray, margin
 
 
 def ground_points(
-    disparity: np.ndarray, view: View, shift: np.ndarray, plane: Rectified, moved: np.ndarray, middle: float
+    disparity: np.ndarray,
+    view: View,
+    shift: np.ndarray,
+    plane: Rectified,
+    moved: np.ndarray,
+    middle: float,
+    above_m: float = np.inf,
 ) -> np.ndarray:
     """Ground points (n, 3) m of all pixels with a disparity.
 
-    disparity : (r, c) px, NaN where there is none; middle : height of the plane, m.
+    disparity : (r, c) px, NaN where there is none; middle : height of the plane, m; above_m : see `cameras_above`.
     """
     rows, cols = np.nonzero(np.isfinite(disparity))
-    z = middle + disparity[rows, cols] * STEP_M / float(np.hypot(*moved))
+    z = disparity[rows, cols] * STEP_M / float(np.hypot(*moved))
+    if np.isfinite(above_m):
+        # A point rises by z where its parallax grows as z / (above_m - z); `moved` is that of RISE_M.
+        z = z * above_m / (above_m - RISE_M + z)
+    z = middle + z
     seen = to_image(view, shift, plane.ground(rows, cols), middle)
     return np.asarray(view.sensor.ground_from_image(seen - shift, z))
 

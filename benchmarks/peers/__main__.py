@@ -26,13 +26,14 @@ sys.path[:] = [str(HERE.parent), *(path for path in sys.path if Path(path or "."
 from peers import builds, matchers  # noqa: E402
 from peers.cars import Cars  # noqa: E402
 from peers.environments import Environment, Missing, installed, this_checkout  # noqa: E402
+from peers.frames import FRAMES  # noqa: E402
 from peers.own import Own  # noqa: E402
 from peers.page import write_page  # noqa: E402
 from peers.running import OWN_RUNS, PeerComparison, Program, run_all  # noqa: E402
 from peers.scenes import RENDERED  # noqa: E402
 from seeds import fresh_seeds  # noqa: E402
 
-NAMES = (*RENDERED, "realistic", "seeds", "jax068", "pleiades", "middlebury", "kernels")
+NAMES = (*RENDERED, *FRAMES, "realistic", "seeds", "jax068", "pleiades", "middlebury", "kernels")
 PROGRAMS = ("zlocus", "CARS", "OpenCV", "Pandora", "s2p", "MicMac", "SETSM")
 BUILDS = {"s2p": builds.S2p, "MicMac": builds.MicMac, "SETSM": builds.Setsm}
 

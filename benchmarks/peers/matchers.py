@@ -52,7 +52,7 @@ class Matcher:
         ]
         job = out / "job.json"
         said = {
-            "images": {name: str(path) for name, path in scene.images.items()},
+            "images": list(scene.images), "inputs": [str(path) for path in scene.inputs],
             "shifts": {name: scene.shift(name) for name in scene.images},
             "crs": scene.crs, "bounds": scene.bounds, "heights": scene.heights, "pairs": pairs,
             "options": self.options(), "threads": len(cores), "surface": str(out / "dsm.tif"),

@@ -32,7 +32,7 @@ class Own:
         command = [
             self.environment.program("zlocus"),
             "dsm",
-            *scene.images.values(),
+            *scene.inputs,
             "-o",
             out / "zlocus",
             "--no-report",

@@ -1,8 +1,9 @@
 """Rectified pairs for matchers, and surfaces from their disparities: `python pairs.py prepare|merge JOB`.
 
 A matcher searches along the rows of two images; it has no cameras and cannot merge pairs. Both are done for it: pairs
-are resampled onto a plane (see `rectifying.py`), the points of each pair are put on the grid (the highest in a cell),
-a cell takes the median of all pairs, and a gap the nearest height. The cost counts as that of the matcher.
+are resampled onto a plane (see `rectifying.py`), the points of each pair that both images show are put on the grid (the
+highest in a cell), a cell takes the median of all pairs, and a gap the nearest height. The cost counts as that of the
+matcher.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rectifying import (
     Rectified,
+    cameras_above,
     disparity_range,
     gridded,
     ground_points,
     on_plane,
     parallax,
     rectified,
+    shown,
     write_surface,
 )
 from zlocus.core.scene import View
@@ -55,8 +58,8 @@ class Area:
 def planes(job: dict[str, Any]) -> list[Plane]:
     """The plane of each pair of a job."""
     area, middle = area_of(job), sum(job["heights"]) / 2
-    names = list(job["images"])
-    views = dict(zip(names, open_scene([Path(path) for path in job["images"].values()]).views, strict=True))
+    opened = open_scene([Path(path) for path in job["inputs"]])
+    views = dict(zip(job["images"], opened.views, strict=True))
     found = []
     for pair in job["pairs"]:
         seen = tuple(views[name] for name in pair["views"])
@@ -76,7 +79,10 @@ def prepare(path: Path) -> None:
     for pair, plane in zip(job["pairs"], planes(job), strict=True):
         for side, view, shift in zip(("left", "right"), plane.views, plane.shifts, strict=True):
             cv2.imwrite(pair[side], on_plane(view, shift, plane.frame, plane.middle).astype(np.float32))
-        pair["first"], pair["count"] = disparity_range(tuple(job["heights"]), plane.moved, 0.0)
+        low, high = job["heights"]
+        # The parallax of frames grows faster above the plane than below.
+        curved = ((high - low) / 2) ** 2 / cameras_above(plane.views, plane.middle)
+        pair["first"], pair["count"] = disparity_range((low, high), plane.moved, curved)
     path.write_text(json.dumps(job, indent=1))
 
 
@@ -85,8 +91,12 @@ def merge(path: Path) -> None:
     job = json.loads(path.read_text())
     surfaces = []
     for pair, plane in zip(job["pairs"], planes(job), strict=True):
-        disparity = np.load(pair["disparity"])
-        xyz = ground_points(disparity, plane.views[0], plane.shifts[0], plane.frame, plane.moved, plane.middle)
+        is_shown = shown(plane.views, plane.shifts, plane.frame, plane.middle)
+        disparity = np.where(is_shown, np.load(pair["disparity"]), np.nan)
+        xyz = ground_points(
+            disparity, plane.views[0], plane.shifts[0], plane.frame, plane.moved, plane.middle,
+            cameras_above(plane.views, plane.middle),
+        )  # fmt: skip
         surfaces.append(gridded(area_of(job), xyz))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # cells that no pair sees

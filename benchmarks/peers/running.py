@@ -20,6 +20,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from judging import JUDGE
 from peers import own
 from peers.environments import Environment
+from peers.frames import FRAMES, takes_frames
 from peers.measuring import Failed, Usage, measured
 from peers.middlebury import middlebury
 from peers.realistic import RealisticScene, jax_scenes, judged_scene, seed_scenes, shared_scenes
@@ -54,9 +55,9 @@ class Program(Protocol):
 class PeerComparison:
     """Measurements to make.
 
-    names : scenes of RENDERED, `pleiades`, `middlebury`, `kernels`; views : numbers of views of rendered scenes, None
-    for all; side : cells along a side of the rendered scenes, None for their own; own_runs : runs of zlocus, of which
-    the median counts; seeds : of the realistic recipe.
+    names : scenes of RENDERED and FRAMES, `pleiades`, `middlebury`, `kernels`; views : numbers of views of rendered
+    scenes, None for all; side : cells along a side of the rendered scenes, or columns of a frame, None for their own;
+    own_runs : runs of zlocus, of which the median counts; seeds : of the realistic recipe.
     """
 
     names: Sequence[str]
@@ -113,6 +114,11 @@ def scenes(comparison: PeerComparison, out: Path) -> Iterator[Scene]:
                 name, rendered = f"{name} of {comparison.side} cells", replace(rendered, side=comparison.side)
             found = rendered.scenes(name, out / "scenes")
             yield from (scene for scene in found if comparison.views is None or len(scene.images) in comparison.views)
+    for name, block in FRAMES.items():
+        if name in comparison.names:
+            if comparison.side not in (None, block.columns):
+                name, block = f"{name} of {comparison.side} columns", replace(block, columns=comparison.side)
+            yield block.scene(name, out / "scenes")
     if "realistic" in comparison.names:
         yield from shared_scenes(out / "scenes")
     if "seeds" in comparison.names:
@@ -137,7 +143,7 @@ def surfaces_of(
     """
     results.describe("scenes", scene.name, described(scene))
     made: dict[str, Path] = {} if scene.reference is None else {"s2p, delivered": scene.reference}
-    for program in programs:
+    for program in (each for each in programs if scene.cameras is None or takes_frames(each.name)):
         key = {"scene": scene.name, "program": program.name, "versions": results.found["programs"][program.name]}
         if scene.truth is None or isinstance(scene, RealisticScene):
             scene = replace(scene, shifts=own.shifts(out / "surfaces" / scene.slug / OWN, scene))

@@ -35,12 +35,13 @@ RANGE_MARGIN_M = 3.0
 
 @dataclass(frozen=True)
 class Scene:
-    """Images with RPC, the area of the surface, and truth or reference data.
+    """Images with RPC or of frame cameras, the area of the surface, and truth or reference data.
 
     images : paths by view, the first one nearest to the nadir; kind : city or hills; bounds : west, south, east, north
     of the area, m; heights : lowest and highest height of the search, m above the ellipsoid; terrain : a coarse terrain
     model (EPSG:4326, above the ellipsoid); truth, classes : exact rasters, None if there are none; reference : surface
-    of another program; shifts : pointing corrections (column, row) px by view, for matchers that cannot find them.
+    of another program; shifts : pointing corrections (column, row) px by view, for matchers that cannot find them;
+    cameras : scene file of the images if their cameras are frame cameras, None if the images have RPC.
     """
 
     name: str
@@ -54,10 +55,16 @@ class Scene:
     classes: Path | None = None
     reference: Path | None = None
     shifts: dict[str, tuple[float, float]] = field(default_factory=dict)
+    cameras: Path | None = None
 
     def shift(self, view: str) -> tuple[float, float]:
         """Pointing correction (column, row) px of a view; zero where none is known."""
         return self.shifts.get(view, (0.0, 0.0))
+
+    @property
+    def inputs(self) -> list[Path]:
+        """What a program that reads scene files is given: that file, or the images with their RPC."""
+        return list(self.images.values()) if self.cameras is None else [self.cameras]
 
     @property
     def slug(self) -> str:
@@ -90,7 +97,7 @@ class Scene:
         low, high = self.heights
         middle = np.array([[(west + east) / 2, (south + north) / 2, low]])
         found = []
-        for view in open_scene(list(self.images.values())).views:
+        for view in open_scene(self.inputs).views:
             seen = view.sensor.image_from_ground(middle)
             above = view.sensor.ground_from_image(seen, np.array([high]))[0]
             ray = above - middle[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+from peers.frames import FRAME
 from peers.page import figure, judged, of_scene, per_million, succeeded
 from peers.verdicts import with_means_of_seeds
 from workplace import ROOT, CannotRun, Figure, Workplace
@@ -23,7 +24,7 @@ def peers(_workplace: Workplace) -> list[Figure]:
         rows = succeeded(run)
         if OWN not in rows or len(rows) < 2:
             raise CannotRun(f"{RESULTS} has no surface of {scene} by {OWN} and by another program")
-        if CARS not in run:
+        if CARS not in run and found["scenes"][scene]["kind"] != FRAME:
             raise CannotRun(f"{RESULTS} has no run of {CARS} on {scene}, whose CPU is compared: run `make peers`")
         own, others = rows.pop(OWN), rows.values()
         within, nmad = (figure(own, "all", what) for what in ("within", "nmad"))
@@ -42,7 +43,7 @@ def peers(_workplace: Workplace) -> list[Figure]:
                     fails_when="zlocus becomes slower, or CARS faster",
                 )
             )
-        else:
+        elif CARS in run:
             # The cost of a run that ends in an error says nothing.
             figures.append(Figure(f"{scene}, runs in which {CARS} failed", run[CARS].get("n_failed", 1)))
     speeds: dict[int, dict[bool, float]] = {}

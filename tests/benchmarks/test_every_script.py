@@ -54,6 +54,7 @@ RUN_BY = {
     "peers/builds.py": "test_peers.py::test_micmac_as_its_documents_say",
     "peers/cars.py": "test_peers_command.py::test_cars_is_run_with_its_configuration",
     "peers/environments.py": "test_peers_command.py::test_an_environment_is_made_once_for_what_is_wanted",
+    "peers/frames.py": "test_peers_frames.py::test_frames_are_matched_and_judged",
     "peers/launch.py": "test_peers.py::test_all_that_is_started_counts",
     "peers/match_opencv.py": "test_peers.py::test_a_matcher_of_rows_finds_a_surface",
     "peers/match_pandora.py": "test_peers_command.py::test_disparities_of_pandora_point_to_the_left",
