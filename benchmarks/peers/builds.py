@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -85,7 +85,7 @@ class S2p:
 
 @dataclass(frozen=True)
 class MicMac:
-    """All images at once on a ground grid: tie points, bundle adjustment, Malt (Rupnik et al. 2017)."""
+    """All images at once on a ground grid by Malt (Rupnik et al. 2017), with the orientation as it is given."""
 
     program: Path
     name: str = "MicMac"
@@ -97,16 +97,22 @@ class MicMac:
         # The patterns of MicMac match every TIFF of a folder.
         work = out / "work"
         work.mkdir(parents=True, exist_ok=True)
-        for path in scene.images.values():
+        for view, path in scene.images.items():
             (work / path.name).symlink_to(path.resolve())
-            write_rpc_txt(work / f"{path.stem}.txt", read_rpc(path))
+            write_rpc_txt(work / f"{path.stem}.txt", corrected(read_rpc(path), scene.shift(view)))
         (work / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(proj_string(scene.crs)))
-        given = {"program": self.program, "resolution": RESOLUTION_M, "cores": len(cores)}
+        box = ",".join(map(str, scene.bounds))
+        given = {"program": self.program, "resolution": RESOLUTION_M, "cores": len(cores), "box": box}
         used = Usage()
         for step in recommended("micmac")["steps"]:
             command = [self.program, *(str(word).format(**given) for word in step), "@ExitOnBrkp"]
             used += measured(command, cores, out / f"{step[0]}.log", work)
         return georeferenced(work / "MEC-Malt", scene, out / "dsm.tif"), used
+
+
+def corrected(rpc: RpcCoefficients, shift: tuple[float, float]) -> RpcCoefficients:
+    """RPC whose image positions are moved by a pointing correction (column, row) px."""
+    return replace(rpc, samp_off=rpc.samp_off + shift[0], line_off=rpc.line_off + shift[1])
 
 
 # Format of MicMac: a projection by a definition of PROJ.
