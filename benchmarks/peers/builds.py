@@ -1,6 +1,6 @@
 """Programs that no package registry has: s2p, MicMac and SETSM, used if a path to a build is given.
 
-Written from their documentation; the machine of the published results had no builds of them. See `configurations/`.
+`configurations/builds.yaml` says which builds they were tried against.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ import yaml
 from pyproj import CRS
 from rasterio.errors import NotGeoreferencedWarning
 
-from peers.environments import CONFIGURATIONS, Missing, digest_of
+from peers.environments import CONFIGURATIONS, Environment, Missing, digest_of
+from peers.isd import metadata, write_isd, write_plain
 from peers.measuring import Failed, Usage, measured
 from peers.scenes import RESOLUTION_M, Scene
 from rectifying import gridded
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.io.cameras.rpc_text import write_rpc_txt
-from zlocus.sensors.rpc import RpcCoefficients
 
 ANSWER_S = 60.0
 
@@ -61,26 +61,59 @@ def said_version(program: Path, *asks: str) -> str:
     return "unknown"
 
 
+# Packages of s2p that compute.
+S2P_PACKAGES = ("s2p", "plyflatten", "rpcm", "numpy")
+
+
 @dataclass(frozen=True)
 class S2p:
-    """Pairs of the first image with each other one, matched by MGM, averaged on a grid (de Franchis et al. 2014)."""
+    """The first image with each other one, matched by MGM, averaged on a grid (de Franchis et al. 2014).
+
+    Where not all images make pairs with the first one (images of many dates), each pair has a surface of its own, and
+    a cell takes their median (Facciolo et al. 2017). program : the command in the environment of a build.
+    """
 
     program: Path
     name: str = "s2p"
 
     def versions(self) -> dict[str, str]:
-        return {"s2p": said_version(self.program, "--version")} | digest("s2p")
+        try:
+            found = Environment(self.program.parents[1]).versions(*S2P_PACKAGES)
+        except (OSError, subprocess.CalledProcessError):
+            found = {"s2p": "unknown"}
+        return found | digest("s2p")
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
+        together = together_with_first(scene)
+        if len(together) == 1:
+            return self.matched(scene, together[0], out, len(cores), cores)
+        used, surfaces = Usage(), []
+        for views in together:
+            surface, cost = self.matched(scene, views, out / "-".join(views), len(cores), cores)
+            used += cost
+            surfaces.append(on_grid(surface, scene))
+        return write_median(surfaces, scene, out / "dsm.tif"), used
+
+    def matched(
+        self, scene: Scene, views: Sequence[str], out: Path, workers: int, cores: Sequence[int]
+    ) -> tuple[Path, Usage]:
+        """Path of the surface of some views, and the cost."""
         out.mkdir(parents=True, exist_ok=True)
         config = recommended("s2p") | {
-            "out_dir": str(out / "s2p"), "temporary_dir": str(out / "tmp"),
-            "images": [{"img": str(path)} for path in scene.images.values()],
-            "dsm_resolution": RESOLUTION_M, "max_processes": len(cores),
+            "out_dir": str(out / "s2p"), "temporary_dir": str(out / "tmp"), "out_crs": scene.crs,
+            "images": [{"img": str(scene.images[view])} for view in views],
+            "dsm_resolution": RESOLUTION_M, "max_processes": workers,
         }  # fmt: skip
         (out / "config.json").write_text(json.dumps(config, indent=1))
         used = measured([self.program, out / "config.json"], cores, out / "s2p.log", out)
         return out / "s2p" / "dsm.tif", used
+
+
+def together_with_first(scene: Scene) -> list[tuple[str, ...]]:
+    """Groups of views that s2p matches at once: all, if each makes a pair with the first one, or the pairs."""
+    first, *others = scene.images
+    usable = [set(pair) for pair in scene.pairs]
+    return [tuple(scene.images)] if all({first, other} in usable for other in others) else [*scene.pairs]
 
 
 @dataclass(frozen=True)
@@ -128,11 +161,17 @@ SYSTEM_OF_COORDINATES = """<SystemeCoord>
 
 def proj_string(crs: str) -> str:
     """A UTM zone in the form of MicMac; raises `Failed` for other systems."""
-    zone = CRS(crs).utm_zone
-    if zone is None:
-        raise Failed(f"MicMac is given UTM zones only, and {crs} is none")
+    zone = utm_zone(crs, "MicMac")
     south = " +south" if zone.endswith("S") else ""
     return f"+proj=utm +zone={zone[:-1]}{south} +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+
+
+def utm_zone(crs: str, program: str) -> str:
+    """Number and hemisphere of a UTM zone, such as 31N; raises `Failed` for other systems."""
+    zone = CRS(crs).utm_zone
+    if zone is None:
+        raise Failed(f"{program} is given UTM zones only, and {crs} is none")
+    return str(zone)
 
 
 def georeferenced(folder: Path, scene: Scene, path: Path) -> Path:
@@ -180,44 +219,30 @@ class Setsm:
 
     def run(self, scene: Scene, out: Path, cores: Sequence[int]) -> tuple[Path, Usage]:
         out.mkdir(parents=True, exist_ok=True)
-        for name, path in scene.images.items():
-            (out / f"{name}.tif").symlink_to(path.resolve())
-            write_isd(out / f"{name}.xml", read_rpc(path))
-        low, high = scene.heights
-        options = [*itertools.chain(*recommended("setsm")["options"].items()), "-outres", RESOLUTION_M]
+        for name, of_image in metadata(scene).items():
+            write_plain(scene.images[name], out / f"{name}.tif")
+            write_isd(out / f"{name}.xml", of_image)
+        given = recommended("setsm")["options"] | options_of(scene) | {"-threads": len(cores)}
         used, surfaces = Usage(), []
         for left, right in scene.pairs:
             pair = out / f"{left}-{right}"
             command = [self.program, "-image", out / f"{left}.tif", "-image", out / f"{right}.tif", "-outpath", pair]
-            command += [*options, "-minH", low, "-maxH", high]
+            command += itertools.chain(*given.items())
             used += measured(command, cores, out / f"{pair.name}.log", out)
-            surfaces.append(on_grid(only(pair, "*_dem.tif"), scene))
+            # A height of SETSM belongs to the upper left corner of its cell.
+            surfaces.append(on_grid(only(pair, f"{pair.name}_dem.tif"), scene, at=0.0))
         return write_median(surfaces, scene, out / "dsm.tif"), used
 
 
-def write_isd(path: Path, rpc: RpcCoefficients) -> None:
-    """Write the RPC as XML of DigitalGlobe, which SETSM reads beside an image of the same name."""
-    root = ElementTree.Element("isd")
-    block = ElementTree.SubElement(root, "RPB")
-    ElementTree.SubElement(block, "SATID").text = "WV01"
-    image = ElementTree.SubElement(block, "IMAGE")
-    scalars = {
-        "LINEOFFSET": rpc.line_off, "SAMPOFFSET": rpc.samp_off, "LATOFFSET": rpc.lat_off, "LONGOFFSET": rpc.lon_off,
-        "HEIGHTOFFSET": rpc.height_off, "LINESCALE": rpc.line_scale, "SAMPSCALE": rpc.samp_scale,
-        "LATSCALE": rpc.lat_scale, "LONGSCALE": rpc.lon_scale, "HEIGHTSCALE": rpc.height_scale,
+def options_of(scene: Scene) -> dict[str, object]:
+    """Options of SETSM that a scene decides: zone, heights, and the area, whose corner is the first height."""
+    west, south, east, north = (edge + RESOLUTION_M / 2 for edge in scene.bounds)
+    zone = utm_zone(scene.crs, "SETSM")
+    return {
+        "-utm_zone": zone[:-1], "-North": int(zone.endswith("N")), "-outres": RESOLUTION_M,
+        "-boundary_min_X": west, "-boundary_min_Y": south, "-boundary_max_X": east, "-boundary_max_Y": north,
+        "-minH": scene.heights[0], "-maxH": scene.heights[1],
     }  # fmt: skip
-    for name, value in scalars.items():
-        ElementTree.SubElement(image, name).text = repr(float(value))
-    terms = {
-        "LINENUMCOEF": rpc.line_num,
-        "LINEDENCOEF": rpc.line_den,
-        "SAMPNUMCOEF": rpc.samp_num,
-        "SAMPDENCOEF": rpc.samp_den,
-    }
-    for name, values in terms.items():
-        listed = ElementTree.SubElement(ElementTree.SubElement(image, f"{name}List"), name)
-        listed.text = " ".join(repr(float(value)) for value in values)
-    ElementTree.ElementTree(root).write(path)
 
 
 def only(folder: Path, pattern: str) -> Path:
@@ -228,14 +253,14 @@ def only(folder: Path, pattern: str) -> Path:
     return found[0]
 
 
-def on_grid(path: Path, scene: Scene) -> np.ndarray:
-    """Heights (r, c) m of a surface on the grid of the scene, NaN without a height."""
+def on_grid(path: Path, scene: Scene, at: float = 0.5) -> np.ndarray:
+    """Heights (r, c) m of a surface on the grid of the scene, NaN without a height. at : their place in a cell."""
     with rasterio.open(path) as file:
         if file.crs is None or file.crs.to_epsg() != CRS(scene.crs).to_epsg():
             raise Failed(f"{path} is in {file.crs}, not in {scene.crs}")
         z = file.read(1, masked=True).astype(float).filled(np.nan)
         rows, cols = np.nonzero(np.isfinite(z) & (np.abs(z) < 9000))
-        x, y = file.transform * (cols + 0.5, rows + 0.5)
+        x, y = file.transform * (cols + at, rows + at)
     return gridded(scene, np.column_stack([x, y, z[rows, cols]]))
 
 

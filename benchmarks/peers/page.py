@@ -10,10 +10,12 @@ from typing import Any
 
 import matplotlib as mpl
 import PIL.Image
+import yaml
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+from peers.environments import CONFIGURATIONS
 from peers.verdicts import (
     HEADINGS,
     OWN,
@@ -64,6 +66,9 @@ All programs get the same images, area, grid and cores.
   height range is that of the truth, a cell takes the median of all pairs, and a gap takes the nearest height. Where
   cameras have pointing errors (Pleiades, WorldView, realistic scenes) they get the corrections of zlocus. Code of this
   comparison does that; its CPU and memory count as theirs.
+- s2p matches the first image with each other one, corrects their pointing itself and finds its ranges by tie points. Of
+  nineteen images it matches the same pairs as other programs of pairs, and a cell takes the median. SETSM gets the
+  area and the height range, corrects the pointing of each pair itself, and a cell takes the median of the pairs.
 - Realistic scenes are rendered images that lie as real ones do. `rendered-real-a` and `-b` were made by other code than
   the scenes of fresh seeds. They are judged after the common height of the ground was removed.
 - JAX_068 are nineteen WorldView-3 images of ten months with a laser surface, judged after the best shift was removed,
@@ -122,9 +127,18 @@ def picture_metadata(found: dict[str, Any]) -> dict[str, str | None]:
 def page_of(found: dict[str, Any]) -> str:
     """Text of the page."""
     found = with_means_of_seeds(found)
-    parts = [HEAD, "\n".join(where(found)), *verdicts(found), "\n".join(pictures()), *scene_tables(found)]
+    parts = [HEAD, "\n".join(builds()), "\n".join(where(found)), *verdicts(found), "\n".join(pictures())]
+    parts += scene_tables(found)
     parts += [*difference_tables(found), *kernel_table(found), *middlebury_table(found), "\n".join(versions(found))]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
+
+
+def builds() -> Iterator[str]:
+    """Lines on the programs that no registry has: which build was tried, or what failed."""
+    yield "Programs that no registry has are measured where a build is given (`--s2p`, `--micmac`, `--setsm`):"
+    yield ""
+    said = yaml.safe_load((CONFIGURATIONS / "builds.yaml").read_text(encoding="utf-8"))
+    yield from (f"- {program}: {' '.join(sentence.split())}" for program, sentence in said.items())
 
 
 def where(found: dict[str, Any]) -> Iterator[str]:

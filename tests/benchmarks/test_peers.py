@@ -20,7 +20,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from peers import builds, cars, environments, matchers, measuring, page, running, scenes
+from peers import builds, cars, environments, isd, matchers, measuring, page, running, scenes
 from peers.results import Results
 from places import ROOT
 from rendered_scenes import CENTRE, HEIGHTS, rendered
@@ -164,24 +164,43 @@ def test_a_matcher_of_rows_finds_a_surface(scene, tmp_path):
     assert used.cpu_s > 0
 
 
+S2P = """
+import json, pathlib, sys
+import numpy as np, rasterio
+config = json.loads(pathlib.Path(sys.argv[1]).read_text())
+assert config["full_img"] is True and config["dsm_resolution"] == 0.5 and config["out_crs"] == "EPSG:32632"
+out = pathlib.Path(config["out_dir"]); out.mkdir()
+names = [pathlib.Path(each["img"]).stem for each in config["images"]]
+print(*names)
+z = np.full((100, 100), 60.0 if "fore" in names[1] else 50.0, np.float32)
+with rasterio.open(out / "dsm.tif", "w", driver="GTiff", height=100, width=100, count=1, dtype="float32",
+                   nodata=np.nan, crs=config["out_crs"],
+                   transform=rasterio.transform.from_origin(461975, 5247025, 0.5, 0.5)) as file:
+    file.write(z, 1)
+"""
+
+
 def test_s2p_as_its_documents_say(scene, tmp_path):
-    build = program(
-        tmp_path,
-        """
-        import json, pathlib, shutil, sys
-        if sys.argv[1] == "--version":
-            sys.exit("s2p 1.4.2")
-        config = json.loads(pathlib.Path(sys.argv[1]).read_text())
-        assert config["full_img"] is True and config["dsm_resolution"] == 0.5 and len(config["images"]) == 3
-        out = pathlib.Path(config["out_dir"])
-        out.mkdir()
-        shutil.copy(pathlib.Path(config["images"][0]["img"]), out / "dsm.tif")
-        """,
-    )
-    s2p = builds.S2p(build)
-    assert s2p.versions()["s2p"] == "1.4.2"
+    """All images at once where the first makes pairs with all others; its version is that of its environment."""
+    bin_ = tmp_path / "environment" / "bin"
+    bin_.mkdir(parents=True)
+    versions = program(bin_, "import sys; print(*('1.0b26' for _ in sys.argv[3:]), sep='\\n')")
+    versions.rename(bin_ / "python")
+    s2p = builds.S2p(program(bin_, S2P))
+    assert s2p.versions()["s2p"] == "1.0b26"
+    assert builds.S2p(tmp_path / "elsewhere" / "s2p").versions()["s2p"] == "unknown"
     dsm, _ = s2p.run(scene, tmp_path / "run", (CORE,))
-    assert dsm.read_bytes() == next(iter(scene.images.values())).read_bytes()
+    assert dsm == tmp_path / "run" / "s2p" / "dsm.tif"
+    assert (tmp_path / "run" / "s2p.log").read_text().split() == [path.stem for path in scene.images.values()]
+
+
+def test_s2p_matches_pairs_where_the_first_image_is_not_in_all(scene, tmp_path):
+    """Of views that meet at 35 degrees, those that make pairs with the one between them; cells take the median."""
+    of_dates = replace(scene, images={name: scene.images[name] for name in ("fore", "nadir", "aft")})
+    assert builds.together_with_first(of_dates) == [("nadir", "fore"), ("nadir", "aft")]
+    dsm, _ = builds.S2p(program(tmp_path, S2P)).run(of_dates, tmp_path / "run", (CORE,))
+    with rasterio.open(dsm) as file:
+        assert (file.read(1) == 55.0).all()
 
 
 def test_micmac_as_its_documents_say(scene, tmp_path):
@@ -225,7 +244,7 @@ def test_micmac_as_its_documents_say(scene, tmp_path):
 
 
 def test_setsm_as_its_manual_says(scene, tmp_path):
-    """Every pair is matched, and cells get the median of the pairs."""
+    """Every pair is matched on the area of the scene, and cells get the median of the pairs."""
     build = program(
         tmp_path,
         """
@@ -233,13 +252,17 @@ def test_setsm_as_its_manual_says(scene, tmp_path):
         import numpy as np, rasterio
         words = sys.argv[1:]
         first, second = (words[k + 1] for k, word in enumerate(words) if word == "-image")
+        said = dict(zip(words[4::2], words[5::2]))
         assert all(pathlib.Path(each).with_suffix(".xml").exists() for each in (first, second))
-        assert words[words.index("-minH") + 1] == "25.0" and words[words.index("-outres") + 1] == "0.5"
-        out = pathlib.Path(words[words.index("-outpath") + 1]); out.mkdir()
-        z = np.full((100, 100), 50.0 if "fore" in second else 52.0, np.float32); z[:, :10] = -9999
-        with rasterio.open(out / "pair_dem.tif", "w", driver="GTiff", height=100, width=100, count=1, dtype="float32",
-                           nodata=-9999, crs="EPSG:32632",
-                           transform=rasterio.transform.from_origin(461975, 5247025, 0.5, 0.5)) as file:
+        assert (said["-minH"], said["-outres"], said["-utm_zone"], said["-North"]) == ("25.0", "0.5", "32", "1")
+        # Its heights stand at the corners of its cells; those of the first row lie north of the area.
+        west, north = float(said["-boundary_min_X"]), float(said["-boundary_max_Y"])
+        out = pathlib.Path(said["-outpath"]); out.mkdir()
+        z = np.full((101, 100), 50.0 if "fore" in second else 52.0, np.float32); z[:, :10] = -9999
+        z[3, 20] = 70.0
+        with rasterio.open(out / f"{out.name}_dem.tif", "w", driver="GTiff", height=101, width=100, count=1,
+                           dtype="float32", nodata=-9999, crs="EPSG:32632",
+                           transform=rasterio.transform.from_origin(west, north, 0.5, 0.5)) as file:
             file.write(z, 1)
         """,
     )
@@ -247,7 +270,41 @@ def test_setsm_as_its_manual_says(scene, tmp_path):
     with rasterio.open(dsm) as file:
         heights = file.read(1)
     assert np.isnan(heights[:, :10]).all()
-    assert (heights[:, 10:] == 51.0).all()
+    assert heights[2, 20] == 70.0
+    assert np.unique(heights[:, 10:]).tolist() == [51.0, 70.0]
+    for name, path in scene.images.items():
+        plain = tmp_path / "run" / f"{name}.tif"
+        with rasterio.open(path) as given:
+            np.testing.assert_array_equal(builds.pixels(plain), given.read(1))
+            assert read_by_lines(plain.with_suffix(".xml"))["LINENUMCOEF"] == given.rpcs.line_num_coeff
+
+
+def read_by_lines(path: Path) -> dict[str, list[float]]:
+    """Numbers of the XML that SETSM is given, read as it does: a tag and its value on each line."""
+    lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    corners = lines.index("<BAND_P>") + 1
+    assert [line[1:3] for line in lines[corners : corners + 12 : 3]] == ["UL", "UR", "LR", "LL"]
+    assert "<IMAGE>" in lines[corners:]
+    values = (re.fullmatch(r"<(\w+)>(.+)</\1>", line) for line in lines)
+    return {
+        match[1]: [float(word) for word in match[2].split()]
+        for match in values
+        if match and match[1] not in ("SATID", "FIRSTLINETIME")
+    }
+
+
+def test_setsm_is_told_where_the_satellite_was(scene):
+    """The angle between the rays of two views, as SETSM computes it of azimuths and elevations; and their pixels."""
+    found, rays = isd.metadata(scene), dict(zip(scene.images, scene.rays(), strict=True))
+    for a, b in scene.pairs:
+        (first, second), turn = (
+            np.radians([found[a].elevation_deg, found[b].elevation_deg]),
+            np.radians(found[a].azimuth_deg - found[b].azimuth_deg),
+        )
+        cosine = np.sin(first) * np.sin(second) + np.cos(first) * np.cos(second) * np.cos(turn)
+        assert cosine == pytest.approx(rays[a] @ rays[b], abs=1e-9)
+    for of_image in found.values():
+        assert of_image.gsd_m == pytest.approx(0.5, abs=0.1)
 
 
 def test_a_program_that_is_not_there_is_named(tmp_path):
