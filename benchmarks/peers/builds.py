@@ -30,6 +30,7 @@ from peers.scenes import RESOLUTION_M, Scene
 from rectifying import gridded
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.io.cameras.rpc_text import write_rpc_txt
+from zlocus.sensors.rpc import RpcCoefficients
 
 ANSWER_S = 60.0
 

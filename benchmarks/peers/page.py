@@ -81,18 +81,10 @@ scene that fills caches. zlocus runs three times, and the median counts. Shares 
 without a rim of 10 m; an empty cell is not within 1 m, and at an edge of the truth both sides are right. NMAD, RMSE
 and LE90 count cells with a height. The best figure of a column is bold.
 
-Not measured:
-
-- Aerial frames (`--scenes "aerial frames" "aerial frames of two strips"`): rendered blocks with a lens distortion and
-  exact cameras, for zlocus, OpenCV and Pandora. The parallax of frames is not linear in height, which is
-  accounted for where OpenCV and Pandora match. OpenCV was tried on a small block. Real frames at hand have no truth
-  that is better than the surface of another program.
-- COLMAP 3.8 (Debian, the build without CUDA) makes no dense surface here: `colmap patch_match_stereo` ends with "Dense
-  stereo reconstruction requires CUDA, which is not available on your system."
-- MicMac (public repository at f8fe4321, CMake without X11 and Qt): its precompiled header and some files of its library
-  were compiled, but not all of it on the busy machine of that day. Its runner follows the source: `Convert2GenBundle`
-  reads the RPC as they are written for it, and `Malt UrbanMNE` takes that orientation. It was not tried.
-- OpenMVS (v2.3.0, with CMake, without CUDA and OpenGL) was configured, but not compiled. It has no runner.
+Not measured yet: aerial frames (`--scenes "aerial frames" "aerial frames of two strips"`), rendered blocks with a lens
+distortion and exact cameras, for zlocus, OpenCV and Pandora. The parallax of frames is not linear in height, which is
+accounted for where OpenCV and Pandora match. Real frames at hand have no truth that is better than the surface of
+another program.
 """
 # Share of the cores used by other processes from which on the page mentions it.
 BESIDE = 0.05
@@ -135,7 +127,10 @@ def page_of(found: dict[str, Any]) -> str:
 
 def builds() -> Iterator[str]:
     """Lines on the programs that no registry has: which build was tried, or what failed."""
-    yield "Programs that no registry has are measured where a build is given (`--s2p`, `--micmac`, `--setsm`):"
+    yield (
+        "Programs that no registry has are measured where a build is given (`--s2p`, `--micmac`, `--setsm`). "
+        "What was tried:"
+    )
     yield ""
     said = yaml.safe_load((CONFIGURATIONS / "builds.yaml").read_text(encoding="utf-8"))
     yield from (f"- {program}: {' '.join(sentence.split())}" for program, sentence in said.items())
