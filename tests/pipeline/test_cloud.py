@@ -16,11 +16,13 @@ import yaml
 from typer.testing import CliRunner
 
 from copc_format import checked_nodes
+from glb_files import meshes
 from las_format import check_laz
 from places import ROOT
 from rendered_scenes import CENTRE, FIELD, GSD_M, HEIGHTS, LOOKS, QUIET, camera
 from zlocus.cli.app import app
-from zlocus.core.errors import CoverageError, OutputError
+from zlocus.core.errors import CoverageError, InputError, OutputError
+from zlocus.core.export_request import ExportRequest
 from zlocus.core.options import RunConfig
 from zlocus.core.progress import SilentProgress
 from zlocus.core.requests import CloudRequest
@@ -28,9 +30,10 @@ from zlocus.io.open_raster import open_raster
 from zlocus.matching.quality import Quality, is_empty
 from zlocus.pipeline import cloud, image_scenes, pixel_products
 from zlocus.pipeline.checked_tiles import CheckedTiles
+from zlocus.pipeline.export import run_export
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.render import Sun, expose, render, visible_ground_points
-from zlocus.synthetic.terrain import analytic_ground
+from zlocus.synthetic.terrain import analytic_ground, analytic_height
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 import middlebury
@@ -253,7 +256,7 @@ def test_one_reference_is_kept_unconfirmed(images, tmp_path):
     assert sorted(p.name for p in result.out.iterdir()) == [
         "cloud.copc.laz", "cloud.copc.qml", "cloud.laz", "cloud.ply", "cloud.qml", "finished.json", "fore_height.qml",
         "fore_height.sld", "fore_height.tif", "fore_quality.qml", "fore_quality.sld", "fore_quality.tif",
-        "fore_quality.tif.aux.xml", "fore_reasons.vrt", "run.json",
+        "fore_quality.tif.aux.xml", "fore_reasons.vrt", "observations.npz", "run.json",
     ]  # fmt: skip
     assert not (read(result.out / "fore_quality.tif") & Quality.INCONSISTENT).any()
     assert "cloud.copc.laz" in json.loads((result.out / "finished.json").read_text())["products"]
@@ -361,3 +364,22 @@ def test_photographs_with_ground_truth(shared_data, tmp_path, case, most_bad):
     found = middlebury.judge(shared_data / "middlebury_multiview", case, tmp_path)
     assert found.zlocus <= most_bad
     assert found.zlocus < found.opencv
+
+
+def test_a_cloud_becomes_a_mesh_with_walls(of_step, tmp_path):
+    """As another image would show it, and where the ground is."""
+    run_export(ExportRequest("mesh", (of_step.out,), tmp_path / "mesh"), SilentProgress())
+    record, reads = meshes(tmp_path / "mesh")
+    assert record["cloud"] == str(of_step.out)
+    assert record["crs"] == "EPSG:32632"
+    points = np.concatenate([read.xyz for read in reads]) + np.array(record["origin"])
+    away = np.abs(points[:, 2] - analytic_height("step", *(points[:, :2] - CENTRE).T))
+    beside = np.abs(points[:, 0] - CENTRE[0]) > 2 * record["cell_m"]
+    assert (away[beside] < WITHIN_M).mean() > LEAST_WITHIN
+    assert ((points[~beside, 2] > 53.0) & (points[~beside, 2] < 62.0)).sum() > 100
+    (tmp_path / "part").mkdir()
+    for name in ("run.json", "fore_height.tif", "fore_quality.tif"):
+        shutil.copy(of_step.out / name, tmp_path / "part" / name)
+    with pytest.raises(InputError, match=r"lacks aft_height.tif"):
+        run_export(ExportRequest("mesh", (tmp_path / "part",), tmp_path / "other"), SilentProgress())
+    assert not (tmp_path / "other").exists()

@@ -12,9 +12,9 @@ import rasterio
 import yaml
 from pyproj import Transformer
 
-from glb_files import read_glb, validator_issues, why_no_validator
+from glb_files import meshes, validator_issues, why_no_validator
 from rendered_scenes import CENTRE, UTM
-from wall_scene import ACROSS_DEG, CELL_M, CELLS, GSD_M, HEIGHT_M, IMAGE, camera, write_scene
+from wall_scene import ACROSS_DEG, CELL_M, CELLS, GSD_M, HEIGHT_M, IMAGE, camera, displacements, write_scene
 from zlocus.core.errors import ConfigError, GeometryError, InputError
 from zlocus.core.export_request import ExportRequest
 from zlocus.core.options import RunConfig
@@ -30,7 +30,6 @@ from zlocus.synthetic.files import write_image
 # Displacement of a wall's texture from its truth, in pixels of the images.
 MOST_PX = 2.0
 MOST_ON_LINE_PX = 0.5
-WINDOW_TEXELS = 32
 # Values of the texture of what an image shows straight on, less the truth: interpolation, JPEG, and pixels' area.
 TOP_RMS = 12.0
 SAME_M = 1e-3
@@ -53,11 +52,6 @@ def mesh(scene):
     folder, _ = scene
     result = exported(folder / "scene", folder / "mesh")
     return folder / "mesh", result
-
-
-def meshes(out):
-    record = json.loads((out / "export.json").read_text())
-    return record, [read_glb(out / tile["file"]) for tile in record["tiles"]]
 
 
 def seen_at(read, points):
@@ -97,18 +91,6 @@ def facade(out, textures):
     points = np.column_stack([x, CENTRE[1] + y.ravel(), z.ravel()]) - np.array(record["origin"])
     found = np.stack([seen_at(read, points) for read in reads])
     return np.nanmax(found, axis=0).reshape(y.shape), textures.wall(y, z)
-
-
-def displacements(found, truth):
-    """Displacements of windows of one picture against another, px."""
-    size, shifts = WINDOW_TEXELS, []
-    window = cv2.createHanningWindow((size, size), cv2.CV_32F)
-    for row in range(0, found.shape[0] - size + 1, size // 4):
-        for col in range(0, found.shape[1] - size + 1, size // 4):
-            parts = [np.asarray(each[row : row + size, col : col + size], np.float32) for each in (found, truth)]
-            parts = [part - part.mean() for part in parts]
-            shifts.append(cv2.phaseCorrelate(*parts, window)[0])
-    return np.hypot(*np.array(shifts).T)
 
 
 def test_a_wall_looks_as_it_does(scene, mesh):
@@ -280,7 +262,7 @@ def test_bad_input_is_refused(scene, tmp_path):
     for wrong, error, said in (
         (replace(request, inputs=(folder / "dsm.tif",)), InputError, "raster without images"),
         (replace(request, inputs=(folder,)), InputError, "no run.json that tells its images"),
-        (replace(request, inputs=(tmp_path,)), InputError, "holds no dsm.tif"),
+        (replace(request, inputs=(tmp_path,)), InputError, "neither a surface"),
         (replace(request, resolution=0.1), ConfigError, "finer than the surface"),
         (replace(request, bounds=(0.0, 0.0, 10.0, 10.0)), GeometryError, "no height inside --bounds"),
     ):

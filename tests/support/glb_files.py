@@ -79,6 +79,12 @@ def read_glb(path: Path) -> ReadMesh:
     return ReadMesh(np.column_stack([placed[:, 0], -placed[:, 2], placed[:, 1]]), uv, triangles, texture, document)
 
 
+def meshes(out: Path) -> tuple[dict, list[ReadMesh]]:
+    """The record of an exported mesh, and its tiles."""
+    record = json.loads((out / "export.json").read_text())
+    return record, [read_glb(out / tile["file"]) for tile in record["tiles"]]
+
+
 def why_no_validator() -> str:
     """Why npm's gltf-validator cannot be had; empty where it is there. It is installed once, below build/."""
     if (NODE_MODULES / "node_modules" / "gltf-validator").is_dir() and shutil.which("node"):

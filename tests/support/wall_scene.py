@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import rasterio
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -17,8 +18,12 @@ CELLS = (28, 56)
 IMAGE = (120, 260)
 # Angles to the side from which the satellites look: two from the east, one from the west, one from above.
 ACROSS_DEG = {"east": -32.0, "far_east": -45.0, "above": -2.0, "west": 25.0}
+# Of an image "between" them, which is not written.
+BETWEEN_DEG = -38.0
 # Texels of the textures, m.
 TEXEL_M = 0.2
+# Side of the windows in which two pictures are compared, px.
+WINDOW_TEXELS = 32
 
 
 class Textures:
@@ -43,8 +48,20 @@ class Textures:
         return self.value(2, along, up)
 
 
+def displacements(found, truth):
+    """Displacements of windows of one picture against another, px."""
+    size, shifts = WINDOW_TEXELS, []
+    window = cv2.createHanningWindow((size, size), cv2.CV_32F)
+    for row in range(0, found.shape[0] - size + 1, size // 4):
+        for col in range(0, found.shape[1] - size + 1, size // 4):
+            parts = [np.asarray(each[row : row + size, col : col + size], np.float32) for each in (found, truth)]
+            parts = [part - part.mean() for part in parts]
+            shifts.append(cv2.phaseCorrelate(*parts, window)[0])
+    return np.hypot(*np.array(shifts).T)
+
+
 def camera(name):
-    return SatelliteCamera((*CENTRE, 5.0), (129.5, 59.5), GSD_M, 3.0, ACROSS_DEG[name])
+    return SatelliteCamera((*CENTRE, 5.0), (129.5, 59.5), GSD_M, 3.0, ACROSS_DEG.get(name, BETWEEN_DEG))
 
 
 def rendered(name, wall_x, textures, samples=2):
@@ -68,6 +85,16 @@ def rendered(name, wall_x, textures, samples=2):
             values[on_wall] = textures.wall(along[on_wall], share[on_wall] * HEIGHT_M)
             total += values.reshape(IMAGE)
     return np.clip(np.rint(total / samples**2), 1, 255).astype(np.uint8)  # 0 is no value
+
+
+def true_heights(name, wall_x):
+    """Height (r, c) m of what each pixel of an image shows."""
+    row, col = np.indices(IMAGE).astype(float)
+    xy = np.column_stack([col.ravel(), row.ravel()])
+    low, high = (camera(name).ground_from_image(xy, np.full(len(xy), z))[:, 0] - CENTRE[0] for z in (0.0, HEIGHT_M))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_wall = (wall_x - low) / (high - low) * HEIGHT_M
+    return np.where(high < wall_x, HEIGHT_M, np.where(low < wall_x, on_wall, 0.0)).reshape(IMAGE)
 
 
 def write_scene(folder, wall_x=0.0):

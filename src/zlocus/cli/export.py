@@ -25,7 +25,7 @@ class ExportOptions:
         list[Path],
         typer.Argument(
             help="Folder of `zlocus orient` or `zlocus dsm`, a scene.yaml, or images with RPC. For a mesh: the folder "
-            "of a surface, or a raster of heights and then its images.",
+            "of a surface or a cloud, or a raster of heights and then its images.",
             metavar="INPUT",
         ),
     ]
@@ -60,12 +60,17 @@ class ExportOptions:
     ] = None  # fmt: skip
     resolution: Annotated[
         float | None,
-        typer.Option(help="Side of the mesh's cells. Default: that of the surface.", metavar="M", rich_help_panel=MESH),
+        typer.Option(
+            help="Side of the mesh's cells. Default: that of the surface, or 1.5 ground pixels of a cloud.",
+            metavar="M",
+            rich_help_panel=MESH,
+        ),
     ] = None
     jump: Annotated[
         float | None,
         typer.Option(
-            help="Difference of neighbouring heights from which on a wall stands between them. Default: two cells.",
+            help="Difference of neighbouring heights of a surface from which on a wall stands between them. Default: "
+            "two cells.",
             metavar="M", rich_help_panel=MESH,
         ),
     ] = None  # fmt: skip

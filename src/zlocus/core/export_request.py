@@ -25,10 +25,10 @@ class ExportRequest:
     """Something to be written for another program. `None` means: not given, to be found.
 
     kind : one of `EXPORT_FORMATS`; inputs : images with a camera, one scene file, or the folder of a run; for a mesh a
-    surface first. bounds : (xmin, ymin, xmax, ymax) m in the CRS of the scene or of the surface; heights : (zmin, zmax)
-    m, ellipsoidal; max_error : px, largest error at which a camera that is not exact is written; points : whether tie
-    points are written. resolution : side of a mesh's cells, m; jump : difference of neighbouring heights from which on
-    a wall stands between them, m.
+    surface first, or a cloud. bounds : (xmin, ymin, xmax, ymax) m in the CRS of the scene or of the surface; heights :
+    (zmin, zmax) m, ellipsoidal; max_error : px, largest error at which a camera that is not exact is written; points :
+    whether tie points are written. resolution : side of a mesh's cells, m; jump : difference of neighbouring heights of
+    a surface from which on a wall stands between them, m.
 
     Raises
     ------

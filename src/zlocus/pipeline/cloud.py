@@ -80,6 +80,7 @@ from zlocus.pipeline.run_plan import (
 from zlocus.pipeline.tile_run import MatchMethod
 from zlocus.products.other_styles import write_other_styles
 from zlocus.products.point_cloud import PointCloud, file_names, write_cloud_copc
+from zlocus.products.tie_observations import write_observations
 from zlocus.sensors.image_rays import DepthRays
 
 # A cloud with heights for a smaller share of the pixels seen by two images is no success.
@@ -223,6 +224,9 @@ def _made(
             "coverage": round(coverage, 6),
             "plan": prepared_cloud.plan.as_dict(),
         }
+        if orientation.refined_ties is not None:
+            # Not among the checked products: ties that are missing are searched again.
+            write_observations(out, orientation.refined_ties)
         write_record(out / RECORD, record)
         write_finished(out, checkpoint.key, shortcoming, names)
         checkpoint.remove()

@@ -18,9 +18,12 @@ from zlocus.core.sensor_model import SensorModel, bare
 from zlocus.io.cameras.rpc import read_rpc
 from zlocus.io.run_record import request_as_dict, versions_record
 from zlocus.io.staged_export import staged_export, write_export_record
+from zlocus.pipeline.export_cloud_mesh import export_cloud_mesh
 from zlocus.pipeline.export_mesh import export_mesh
 from zlocus.pipeline.export_views import OpenedExport, area_of_export, open_export
 from zlocus.pipeline.messages import some_names
+from zlocus.pipeline.opened_cloud import is_cloud
+from zlocus.pipeline.ortho import SURFACE
 from zlocus.products import colmap_model, nerf_transforms
 from zlocus.products.adjust_files import PREFIX, adjust_file_name, write_adjust
 from zlocus.products.exported_images import FOLDER, ExportArea, ExportedView, exported_view, write_image
@@ -61,7 +64,9 @@ def run_export(request: ExportRequest, progress: Progress) -> ExportResult:
     """
     check_output(request.out, request.overwrite, (EXPORT_RECORD,), "export")
     if request.kind == "mesh":
-        text, record = export_mesh(request, progress)
+        first = request.inputs[0]
+        of_cloud = not (first / SURFACE).is_file() and is_cloud(first)
+        text, record = (export_cloud_mesh if of_cloud else export_mesh)(request, progress)
     elif request.kind in ("asp", "rpc"):
         text, record = _export_rpcs(request, progress)
     else:

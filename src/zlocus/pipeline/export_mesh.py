@@ -11,25 +11,24 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 
 from zlocus.core.errors import ConfigError, GeometryError, InputError
-from zlocus.core.export_request import EXPORT_RECORD, ExportRequest
+from zlocus.core.export_request import ExportRequest
 from zlocus.core.footprints import Bounds, ground_sample_distance
 from zlocus.core.progress import Progress
 from zlocus.core.request_checks import check_inputs
 from zlocus.core.scene import View, is_local
-from zlocus.io.run_record import request_as_dict, versions_record
 from zlocus.io.scene_file import open_scene
-from zlocus.io.staged_export import staged_export, write_export_record
+from zlocus.io.staged_export import staged_export
 from zlocus.io.surface_heights import SurfaceHeights, open_surface
+from zlocus.pipeline.mesh_record import MeshFrame, write_mesh_record, write_mesh_tile
 from zlocus.pipeline.ortho import SURFACE, oriented_run
 from zlocus.pipeline.setup import opencv_in_one_thread, sorted_views
 from zlocus.products.exported_images import grey_limits, shown_bands
-from zlocus.products.glb import TexturedMesh, glb_bytes
+from zlocus.products.glb import TexturedMesh
 from zlocus.products.mesh_geometry import CellPatches, Walls, surface_mesh
 from zlocus.products.mesh_sight import MAX_CELLS, SurfaceWindow
 from zlocus.products.mesh_texture import TextureImage, TextureLayout, mesh_texture
-from zlocus.products.mesh_tileset import TILESET, MeshTile, write_tileset
+from zlocus.products.mesh_tileset import MeshTile
 from zlocus.products.report.file_names import RECORD
-from zlocus.sensors.frame import as_row
 
 # Cells along the side of a tile, and texels of its texture: fewer cells where a cell shows many pixels.
 MAX_TILE_CELLS, MIN_TILE_CELLS, TILE_TEXELS = 256, 32, 1024
@@ -37,19 +36,18 @@ MAX_TILE_CELLS, MIN_TILE_CELLS, TILE_TEXELS = 256, 32, 1024
 MAX_TEXELS_PER_CELL = 8
 # Neighbours that differ by more cells than this have a wall between them.
 JUMP_CELLS = 2.0
-ORIGIN_STEP_M = 1.0
 # Points along each side of a tile that are projected to find the images that may show it.
 BOX_POINTS = 9
 
 
 @dataclass(frozen=True)
 class MeshSetup:
-    """What all tiles share. geobox : of the cells of the mesh; origin : (3,) m of its coordinates."""
+    """What all tiles share. geobox : of the cells of the mesh; mesh_frame : of its coordinates."""
 
     surface: SurfaceHeights
     images: list[TextureImage]
     geobox: GeoBox
-    origin: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+    mesh_frame: MeshFrame
     jump_m: float
     per_cell: int
 
@@ -89,23 +87,11 @@ def export_mesh(request: ExportRequest, progress: Progress) -> tuple[str, dict[s
                 tiles.append(tile)
         if not tiles:
             raise GeometryError(f"{surface.path} has no height inside --bounds. Check them.")
-        write_tileset(stage / TILESET, tiles, setup.origin, surface.crs, _size(tiles))
-        record = {
-            "format": request.kind, "request": request_as_dict(request), "versions": versions_record(),
-            "surface": str(surface.path),
-            "crs": None if is_local(surface.crs) else surface.crs.to_string(), "heights": _heights_of(surface),
-            "origin": setup.origin.tolist(), "axes": "x east, y up, z south, from the origin", "jump_m": setup.jump_m,
-            "cell_m": float(setup.geobox.transform.a), "texel_m": float(setup.geobox.transform.a) / setup.per_cell,
-            "tiles": [tile.as_dict() for tile in tiles],
+        of_kind = {
+            "surface": str(surface.path), "jump_m": setup.jump_m, "cell_m": float(setup.geobox.transform.a),
+            "texel_m": float(setup.geobox.transform.a) / setup.per_cell,
         }  # fmt: skip
-        write_export_record(stage, record)
-    n_triangles, n_walls = sum(tile.n_triangles for tile in tiles), sum(tile.n_walls for tile in tiles)
-    n_unseen = sum(tile.n_unseen for tile in tiles)
-    text = (
-        f"{request.out / TILESET}: {len(tiles)} tiles, {n_triangles} triangles, {n_walls} walls; {n_unseen} "
-        f"faces that no image shows are grey. Origin: see {request.out / EXPORT_RECORD}."
-    )
-    return text, record
+        return write_mesh_record(stage, request, setup.mesh_frame, tiles, of_kind)
 
 
 def _opened(request: ExportRequest) -> tuple[SurfaceHeights, Sequence[View]]:
@@ -117,7 +103,10 @@ def _opened(request: ExportRequest) -> tuple[SurfaceHeights, Sequence[View]]:
             raise InputError(f"{first} is a raster without images. Name the images, or a scene.yaml, behind it.")
         return surface, _named_views(tuple(others), surface)
     if not (first / SURFACE).is_file():
-        raise InputError(f"{first} holds no {SURFACE}. Give the folder of a surface, or a raster of heights.")
+        raise InputError(
+            f"{first} is the folder of neither a surface ({SURFACE}) nor a cloud ({RECORD} of `zlocus cloud`). Give "
+            "one of these, or a raster of heights."
+        )
     surface = open_surface(first / SURFACE, may_be_local=True)
     if others:
         return surface, _named_views(tuple(others), surface)
@@ -154,8 +143,9 @@ def _setup(request: ExportRequest, surface: SurfaceHeights, views: Sequence[View
     pixels = [ground_sample_distance(view, surface.median) for view in views]
     known = [pixel for pixel in pixels if np.isfinite(pixel)]
     per_cell = int(np.clip(round(cell_m / np.median(known)), 1, MAX_TEXELS_PER_CELL)) if known else 1
-    origin = np.rint(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M
-    return MeshSetup(surface, images, geobox, origin, request.jump or JUMP_CELLS * cell_m, per_cell)
+    return MeshSetup(
+        surface, images, geobox, MeshFrame.around(surface.crs, middle), request.jump or JUMP_CELLS * cell_m, per_cell
+    )
 
 
 def _write_tile(stage: Path, setup: MeshSetup, row: int, col: int) -> MeshTile | None:
@@ -176,20 +166,8 @@ def _write_tile(stage: Path, setup: MeshSetup, row: int, col: int) -> MeshTile |
     mesh = _mesh(patches, walls, layout, window, setup)
     textured_mesh = TexturedMesh(*mesh[:3], texture.values, mesh[3])
     name = f"tile_{row // setup.side}_{col // setup.side}"
-    extras = {
-        "crs": None if is_local(setup.surface.crs) else setup.surface.crs.to_string(),
-        "heights": _heights_of(setup.surface), "origin": setup.origin.tolist(),
-        "axes": "x east, y up, z south, m from the origin",
-    }  # fmt: skip
-    (stage / f"{name}.glb").write_bytes(glb_bytes(name, textured_mesh, extras))
-    placed = textured_mesh.xyz + np.array(textured_mesh.origin)
-    low, high = as_row(placed.min(axis=0)), as_row(placed.max(axis=0))
     n_unseen = texture.n_unseen_patches + texture.n_unseen_walls
-    return MeshTile(f"{name}.glb", low, high, len(textured_mesh.triangles), len(walls), n_unseen)
-
-
-def _heights_of(surface: SurfaceHeights) -> str:
-    return "of the local frame" if is_local(surface.crs) else "ellipsoidal, m"
+    return write_mesh_tile(stage, name, setup.mesh_frame, textured_mesh, len(walls), n_unseen)
 
 
 def _cells(surface: SurfaceHeights, bounds: Bounds | None, per_side: int) -> GeoBox:
@@ -268,7 +246,7 @@ def _mesh(
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     points = np.concatenate([unique, walls.outlines.reshape(-1, 3)])
     uv = np.concatenate([uv, _wall_uv(walls, layout)])
-    ground = window.ground(points) - setup.origin
+    ground = window.ground(points) - setup.mesh_frame.origin
     origin = np.rint(ground.mean(axis=0))
     xyz = ground - origin
     # Walls that end in a point have a triangle without area.
@@ -288,9 +266,3 @@ def _wall_uv(walls: Walls, layout: TextureLayout) -> Any:
     share = (z - low) / np.maximum(high - low, 1e-9)
     bottom, top = uv[:, :1, 1], uv[:, 2:3, 1]
     return np.stack([uv[..., 0], bottom + share * (top - bottom)], axis=-1).reshape(-1, 2)
-
-
-def _size(tiles: Sequence[MeshTile]) -> float:
-    """Size of the whole mesh, m."""
-    low = np.min([tile.low for tile in tiles], axis=0)
-    return float(np.linalg.norm(np.max([tile.high for tile in tiles], axis=0) - low))
