@@ -28,6 +28,7 @@ MOST_PX = 2.0
 # Values of the picture less the truth: interpolation, JPEG, pixels' area, and edges.
 MOST_RMS = 14.0
 SAME_M = 1e-3
+AROUND_WALL = (CENTRE[0] - 5.0, CENTRE[1] - 13.5, CENTRE[0] + 5.0, CENTRE[1] + 13.5)
 PART = (CENTRE[0] - 8.0, CENTRE[1] - 7.0, CENTRE[0] + 8.0, CENTRE[1] + 7.0)
 
 
@@ -61,7 +62,7 @@ def exported(opened, out, **asked):
 @pytest.fixture(scope="module")
 def mesh(opened, tmp_path_factory):
     out = tmp_path_factory.mktemp("mesh") / "out"
-    return out, *exported(opened, out)
+    return out, *exported(opened, out, bounds=AROUND_WALL)
 
 
 def test_a_new_image_shows_the_wall_where_it_is(opened, mesh):
@@ -95,7 +96,7 @@ def test_the_wall_is_geometry(mesh):
     assert record["tiles"][0]["file"] == "tile_0_0.glb"
     assert mesh[1].startswith(str(mesh[0] / "tileset.json"))
     unseen = sum(tile["faces_not_seen"] for tile in record["tiles"])
-    assert unseen < 0.03 * sum(tile["triangles"] for tile in record["tiles"])  # beyond the borders of images
+    assert unseen < 0.05 * sum(tile["triangles"] for tile in record["tiles"])  # beyond the borders of images
 
 
 def test_the_files_are_valid(mesh):
