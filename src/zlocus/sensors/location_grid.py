@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
-from scipy.linalg import solve_banded
 
 from zlocus.core.sensor_model import FloatArray
 from zlocus.sensors.earth_frame import EarthSpace, between
@@ -147,6 +146,8 @@ def spline_coefficients(values: FloatArray, axis: int) -> FloatArray:
     The third derivative is continuous one node inside of each end ("not a knot"). Three values give a parabola, two a
     straight line. Source: de Boor 1978, A Practical Guide to Splines, chapters IV and IX.
     """
+    from scipy.linalg import solve_banded  # a tenth of a second that runs without such cameras do not need
+
     n = values.shape[axis]
     # The condition at the first end; that at the last one is its mirror image.
     end = {2: [1.0, -2.0, 1.0], 3: [1.0, -3.0, 3.0, -1.0]}.get(n, [1.0, -4.0, 6.0, -4.0, 1.0])
