@@ -30,8 +30,8 @@ SEARCH_STEPS, SEARCH_POINTS = 5, 20_000
 # Slopes of medians of 3 x 3 cells are measured over at least so many cells to each side, so that they share no cell
 # with the height between four: noise of the height then does not pull the shift to where it is averaged most.
 SLOPE_CELLS = 3.0
-# A shift counts as known where its standard error is below half a cell, or below a third of the shift itself.
-MAX_SIGMA_CELLS, MAX_SIGMA_SHARE = 0.5, 1.0 / 3.0
+# A shift counts as known where its standard error is below half a cell, or below a fifth of the shift itself.
+MAX_SIGMA_CELLS, MAX_SIGMA_SHARE = 0.5, 0.2
 # Differences are compared with those of shifts some metres and some cells beside.
 BESIDE_CELLS = 8
 # Two halves of a scene, each a half of so many areas along a side, must give shifts that differ by at most so many
