@@ -51,6 +51,7 @@ RUN_BY = {
     "pages/spans.py": "test_figures.py::test_the_pages_show_their_results",
     "pages/tables.py": "test_figures.py::test_the_pages_show_their_results",
     "peers/__main__.py": "test_peers_command.py::test_zlocus_alone_is_compared_with_the_truth",
+    "peers/isd.py": "test_peers.py::test_setsm_is_told_where_the_satellite_was",
     "peers/builds.py": "test_peers.py::test_micmac_as_its_documents_say",
     "peers/cars.py": "test_peers_command.py::test_cars_is_run_with_its_configuration",
     "peers/environments.py": "test_peers_command.py::test_an_environment_is_made_once_for_what_is_wanted",

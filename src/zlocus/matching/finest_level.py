@@ -86,20 +86,20 @@ def _known_ortho(result: LevelResult, lattice_index: NDArray[np.float32], view: 
 
 def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:
     """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
-    measured = _measured_heights(tile, result, ground)
-    lattice_index, quality = measured.lattice_index, measured.quality
+    measured_heights = _measure(tile, result, ground)
+    lattice_index, quality = measured_heights.lattice_index, measured_heights.quality
     if tile.method != "mvll":
-        lattice_index = _smoothed(tile, result, measured)
+        lattice_index = _smoothed(tile, result, measured_heights)
     height = result.lattice.metres(lattice_index)
-    sigma = measured.sigma * np.float32(tile.match_scene.height_step)
+    sigma = measured_heights.sigma * np.float32(tile.match_scene.height_step)
     height[is_empty(quality)] = np.nan
     sigma[is_empty(quality)] = np.nan
-    n_images = np.where(np.isnan(height), 0, measured.n_views).astype(np.uint8)
+    n_images = np.where(np.isnan(height), 0, measured_heights.n_views).astype(np.uint8)
     surface = Surface(height, sigma, quality, n_images, np.full_like(height, np.nan))
     return RefinedSurface(surface, lattice_index)
 
 
-def _measured_heights(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> MeasuredHeights:
+def _measure(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> MeasuredHeights:
     """Refine the heights of single cells, check them, and estimate their precision."""
     match_scene, config = tile.match_scene, tile.config
     splines, layout = np.empty_like(result.tile_views.pixels), result.tile_views.layout
@@ -125,19 +125,19 @@ def _measured_heights(tile: TileInputs, result: LevelResult, ground: OverlapGrou
     return MeasuredHeights(refined.height, sigma, quality, n_views)
 
 
-def _smoothed(tile: TileInputs, result: LevelResult, measured: MeasuredHeights) -> NDArray[np.float32]:
+def _smoothed(tile: TileInputs, result: LevelResult, measured_heights: MeasuredHeights) -> NDArray[np.float32]:
     """Heights (r, c) smoothed by local planes, and medians of those that stay uncertain.
 
     The standard deviations stay: in some scenes the errors reach farther than the planes.
     """
-    options, core, is_known = tile.config.refine, result.level.core, ~is_empty(measured.quality)
+    options, core, is_known = tile.config.refine, result.level.core, ~is_empty(measured_heights.quality)
     sides = [side for side in SIDES if side <= value_of(options, "max_plane_side")]
-    smooth = smoothed_by_planes(measured.lattice_index, measured.sigma, is_known, core, sides).height
+    smooth = smoothed_by_planes(measured_heights.lattice_index, measured_heights.sigma, is_known, core, sides).height
     is_covered = covers(result.visible)
     agrees = np.ones(len(is_covered)) if result.agreement is None else result.agreement
     grey = edge_image(result.tile_views, smooth, is_covered, core, agrees)
     return with_medians(
-        smooth, measured.sigma, grey, is_known, options.median_sigma_steps, texture_unit(grey, core)
+        smooth, measured_heights.sigma, grey, is_known, options.median_sigma_steps, texture_unit(grey, core)
     )  # fmt: skip
 
 

@@ -237,10 +237,10 @@ def _tiles(setup: CloudMeshSetup, columns: dict[tuple[int, int], tuple[float, fl
 
 
 def _write_tile(
-    stage: Path, name: str, setup: CloudMeshSetup, mesh_frame: MeshFrame, tile: ColumnTile
+    stage: Path, name: str, setup: CloudMeshSetup, mesh_frame: MeshFrame, column_tile: ColumnTile
 ) -> MeshTile | None:
     """Write a tile; None where it has no surface."""
-    cube = tile.cube(setup.cell_m)
+    cube = column_tile.cube(setup.cell_m)
     numbers, range_maps = _range_maps(setup, cube)
     values = fused(range_maps, cube, setup.band_m)
     close_below(values, range_maps, cube, setup.band_m)
@@ -315,12 +315,12 @@ def _window_of(image_map: ImageMap, box: FloatArray, margin: int) -> CellWindow 
     return CellWindow(int(top), int(left), int(bottom - top), int(right - left))
 
 
-def _belongs(setup: CloudMeshSetup, surface: QuadSurface, cube: VoxelCube) -> NDArray[np.bool_]:
+def _belongs(setup: CloudMeshSetup, quad_surface: QuadSurface, cube: VoxelCube) -> NDArray[np.bool_]:
     """Which faces (k,) belong to the tile in the middle of a cube, and lie inside the bounds."""
-    at = surface.edges[:, :2] - MARGIN_NODES
+    at = quad_surface.edges[:, :2] - MARGIN_NODES
     inside = ((at >= 0) & (at < np.array(cube.shape[:2]) - 2 * MARGIN_NODES)).all(axis=1)
     if setup.bounds is not None:
-        place = (surface.edges[:, :2] + cube.first[:2]) * setup.cell_m
+        place = (quad_surface.edges[:, :2] + cube.first[:2]) * setup.cell_m
         west, south, east, north = setup.bounds
         inside &= ((place >= [west, south]) & (place < [east, north])).all(axis=1)
     return np.asarray(inside)

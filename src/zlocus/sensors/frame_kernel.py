@@ -69,17 +69,6 @@ def image_of_rays(rays, camera, lens, out):
         out[n, 1] = real_y * camera.focal * camera.aspect + camera.row
 
 
-# f8, LensNumbers -> f8, f8
-@kernel
-def radial_factor(r2, lens):
-    """By how much the lens moves a position outwards, and the derivative of that by its squared radius."""
-    above = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
-    below = 1.0 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6))
-    above_slope = lens.k1 + r2 * (2.0 * lens.k2 + r2 * 3.0 * lens.k3)
-    below_slope = lens.k4 + r2 * (2.0 * lens.k5 + r2 * 3.0 * lens.k6)
-    return above / below, (above_slope * below - above * below_slope) / (below * below)
-
-
 # (n,2) f8, LensNumbers, (n,2) f8 -> None
 @kernel
 def ideal_positions(real, lens, ideal):
@@ -92,7 +81,12 @@ def ideal_positions(real, lens, ideal):
         x, y, is_last = ideal[n, 0], ideal[n, 1], False
         for _ in range(MAX_ITERATIONS + 1):
             r2 = x * x + y * y
-            factor, slope = radial_factor(r2, lens)
+            above = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+            below = 1.0 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6))
+            # The radial factor and its derivative by the squared radius.
+            factor, rise = above / below, lens.k1 + r2 * (2.0 * lens.k2 + r2 * 3.0 * lens.k3)
+            fall = lens.k4 + r2 * (2.0 * lens.k5 + r2 * 3.0 * lens.k6)
+            slope = (rise * below - above * fall) / (below * below)
             dx = real[n, 0] - (x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
             dy = real[n, 1] - (y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
             if is_last:
