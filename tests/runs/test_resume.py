@@ -50,7 +50,7 @@ from zlocus.pipeline.execution.checkpoint import BEFORE, FOLDER
 from zlocus.pipeline.execution.tasks import MAX_ATTEMPTS
 
 # Number of signals at random moments; benchmarks/acceptance.py sends more.
-SIGNALS = int(os.environ.get("ZLOCUS_SIGNALS", "3"))
+SIGNALS = int(os.environ.get("ZLOCUS_SIGNALS", "2"))
 SEED = 20261122
 # Side of nine tiles of the area, cells: enough for a worker that takes the place of another one.
 SIDE_OF_NINE = 64

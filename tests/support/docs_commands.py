@@ -350,8 +350,8 @@ IN_SMALL = {
     "docs/tutorials/delivery_to_contours.md": {"--size 300": "--size 96", "egm2008 --": "geoid.tif --"},
     "docs/tutorials/many_dates.md": {"--size 240": "--size 120 --views 8", "img_20140[89]": "img_2014"},
     "docs/tutorials/drone_block.md": {
-        "--resolution 0.4": "--resolution 1.2",
-        "--reference s2_2": "--reference s2_2 --bounds 462195 5247295 462205 5247305",
+        "--resolution 0.4": "--resolution 1.2 --no-report",
+        "--reference s1_2 --reference s2_2": "--reference s1_2 --bounds 462195 5247295 462205 5247305",
     },
 }
 
