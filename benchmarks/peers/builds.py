@@ -132,7 +132,7 @@ class MicMac:
         work = out / "work"
         work.mkdir(parents=True, exist_ok=True)
         for view, path in scene.images.items():
-            (work / path.name).symlink_to(path.resolve())
+            write_plain(path, work / path.name)  # it reads no compressed images
             write_rpc_txt(work / f"{path.stem}.txt", corrected(read_rpc(path), scene.shift(view)))
         (work / "ground.xml").write_text(SYSTEM_OF_COORDINATES.format(proj_string(scene.crs)))
         box = ",".join(map(str, scene.bounds))
