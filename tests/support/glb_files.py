@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from places import ROOT
 
@@ -104,3 +105,12 @@ def validator_issues(paths) -> list[dict]:
     words = ["node", "-e", SCRIPT, str(NODE_MODULES), *map(str, paths)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=NPM_S, check=True)
     return json.loads(done.stdout)
+
+
+def check_valid(paths) -> None:
+    """Assert that npm's gltf-validator finds no error and no warning in files; skips where it cannot be had."""
+    why = why_no_validator()
+    if why:
+        pytest.skip(f"npm's gltf-validator cannot be had: {why}")
+    for issues in validator_issues(paths):
+        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
