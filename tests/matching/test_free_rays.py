@@ -17,6 +17,7 @@ from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.view_directions import cells_along_rays
 
 HEIGHT_TOLERANCE_STEPS = 1e-3
+STEP_CELLS = 0.5
 
 
 @pytest.mark.parametrize(
@@ -71,9 +72,26 @@ def test_agreement_of_pairs_against_its_slow_twin():
     limits = stage.MIN_NCC, stage.MAX_GREY_DIFFERENCE, stage.MAX_DEVIATION_WITHOUT_TEXTURE
     textured, untextured = twin.agreeing_images(grey, covers, stage.WINDOW_CELLS, *limits)
     np.testing.assert_array_equal(found.textured, textured)
+    np.testing.assert_array_equal(found.clearly, textured)
     np.testing.assert_array_equal(found.untextured, untextured)
     assert (textured >= 2).any()
     assert (untextured >= 1).any()
+
+
+def test_a_pair_must_agree_better_to_see_a_cell_and_less_well_to_keep_its_height():
+    rng = np.random.default_rng(9)
+    truth = gaussian_filter(rng.normal(size=(40, 40)), 1.0) * 3
+    grey = np.stack([truth + rng.normal(scale=scale, size=truth.shape) for scale in (0.3, 0.3)]).astype(np.float32)
+    covers = np.ones(grey.shape, bool)
+    found = pair_agreement(grey, covers)
+    others = stage.MAX_GREY_DIFFERENCE, stage.MAX_DEVIATION_WITHOUT_TEXTURE
+    for counts, min_ncc in (
+        (found.clearly, stage.MIN_NCC_TO_SEE_OF_PAIR),
+        (found.textured, stage.MIN_NCC_AT_HEIGHT_OF_PAIR),
+    ):
+        expected, _ = twin.agreeing_images(grey, covers, stage.WINDOW_CELLS, min_ncc, *others)
+        np.testing.assert_array_equal(counts, expected)
+    assert 0 < found.clearly.sum() < found.textured.sum()
 
 
 @pytest.mark.parametrize(("n_views", "needed"), [(2, 1), (3, 2), (6, 2), (9, 4), (19, 8)])
@@ -81,7 +99,7 @@ def test_a_height_is_seen_where_a_share_of_the_images_agree(n_views, needed):
     shape, covering = (n_views, 9, 9), np.full((9, 9), n_views)
     for n_agreeing in range(n_views):
         some, none = np.full(shape, n_agreeing, np.uint8), np.zeros(shape, np.uint8)
-        for agreement in (PairAgreement(some, none, covering), PairAgreement(none, some, covering)):
+        for agreement in (PairAgreement(some, none, none, covering), PairAgreement(none, none, some, covering)):
             assert (agreement.height_is_seen == (n_agreeing >= needed)).all()
 
 
@@ -111,7 +129,7 @@ def test_a_height_in_free_air_becomes_more_expensive_than_the_ground():
     views, lattice = level_ground()
     base, cost = SlopeSurface.flat(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
     visible = covered_heights(views, base, lattice)
-    assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0)
+    assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0, step_cells=STEP_CELLS)
     by_cell = cost.reshape(lattice.shape[0], -1)
     for row, col in ((28, 38), (30, 40), (31, 41)):
         b, d = row // BLOCK, col // BLOCK
@@ -127,15 +145,23 @@ def test_two_images_have_free_rays_too():
     views, lattice = level_ground(ANGLES_DEG[:2])
     base, cost = SlopeSurface.flat(SHAPE, BLOCK), np.full(lattice.size, 50, np.uint8)
     visible = covered_heights(views, base, lattice)
-    assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0)
+    assert add_costs_of_rays(cost, views, base, lattice, visible, with_patch(), level=0, step_cells=STEP_CELLS)
     assert (cost > 50).any()
-    assert cost.max() <= 50 + 2 * stage.RAY_COST
+    assert cost.max() <= 50 + stage.MAX_RAY_COST
+
+
+@pytest.mark.parametrize(
+    ("level", "step_cells", "margin"), [(0, 0.5, 8.0), (0, 1.8, 4.0), (1, 0.5, 4.0), (2, 1.8, 2.0), (0, 3.6, 2.0)]
+)
+def test_margin_above_a_ray_is_lower_where_steps_are_high(level, step_cells, margin):
+    assert stage.margin_above_ray(level, step_cells) == pytest.approx(margin)
 
 
 def test_rays_cost_more_where_many_views_cover_the_cells():
     """There no view is excluded by the coarser surface; at coarser levels jumps are cheaper."""
     assert stage.costs_of_ray(0, 12.0) == (stage.RAY_COST, stage.MAX_RAY_COST)
-    assert stage.costs_of_ray(1, 2.0) == (stage.COARSER_RAY_COST, stage.MAX_RAY_COST)
+    assert stage.costs_of_ray(1, 3.0) == (stage.COARSER_RAY_COST, stage.MAX_RAY_COST)
+    assert stage.costs_of_ray(1, 2.0) == stage.costs_of_ray(0, 2.0) == (stage.RAY_COST_OF_PAIR, stage.MAX_RAY_COST)
     assert stage.costs_of_ray(0, 13.0) == (stage.RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
     assert stage.costs_of_ray(2, 19.0) == (stage.COARSER_RAY_COST_OF_MANY, stage.MAX_RAY_COST_OF_MANY)
 

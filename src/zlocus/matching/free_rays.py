@@ -21,7 +21,7 @@ from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.free_rays import add_ray_costs, lowest_free_ray
 from zlocus.matching.kernels.shared_records import VisibleHeights
 from zlocus.matching.local_contrast import ALL, Part
-from zlocus.matching.occlusion import MANY_VIEWS, covers_at, usual_number
+from zlocus.matching.occlusion import MANY_VIEWS, PAIR, covers_at, usual_number
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.tile_views import TileViews
 from zlocus.matching.true_ortho import ortho_image
@@ -31,6 +31,9 @@ from zlocus.matching.view_directions import cells_along_rays, cells_per_step, pa
 # grey values differ by less than MAX_GREY_DIFFERENCE, as a share of the standard deviation of an image's grey values.
 WINDOW_CELLS = 5
 MIN_NCC, MAX_GREY_DIFFERENCE = 0.6, 0.3
+# Where there are only two images, the surface was chosen for their agreement, so that they often agree by chance. To
+# clearly see a cell they must agree better, and to keep it at its own height less well.
+MIN_NCC_TO_SEE_OF_PAIR, MIN_NCC_AT_HEIGHT_OF_PAIR = 0.75, 0.5
 # On ground without texture, such as a plain roof, correlation is noise. Two images agree there where the standard
 # deviations of both windows and the difference of the grey values are less than this.
 MAX_DEVIATION_WITHOUT_TEXTURE = 0.15
@@ -46,11 +49,15 @@ MIN_AGREEING_AT_HEIGHT, MIN_SHARE_AGREEING = 2, 0.4
 # Holes of this shape between such cells are closed where so many images take part.
 MIN_VIEWS_TO_CLOSE = 5
 CLOSED_SHAPE = np.ones((5, 5), np.uint8)
-# Height steps by which a height must stand above a ray to obstruct it, and the cost of doing so for each ray, at the
-# finest level and at coarser ones, where a step is higher and jumps are cheaper; and the largest cost. Where many views
-# cover the cells, no view is excluded by the coarser surface, and the rays alone tell that a tower is too wide.
+# A height must stand so many steps above a ray to obstruct it, at the finest level and at coarser ones, where a step is
+# higher; and no more than so many sides of a cell of the level, because with a narrow base steps are high.
 MARGIN_STEPS, COARSER_MARGIN_STEPS = 8.0, 4.0
+MARGIN_SIDES, COARSER_MARGIN_SIDES = 7.2, 3.6
+# The cost of obstructing a ray, at the finest level and at coarser ones, where a step is higher and jumps are cheaper,
+# and the largest cost. A pair has no more than two rays, and each costs more. Where many views cover the cells, no view
+# is excluded by the coarser surface, and the rays alone tell that a tower is too wide.
 RAY_COST, COARSER_RAY_COST, MAX_RAY_COST = 12, 20, 80
+RAY_COST_OF_PAIR = 40
 RAY_COST_OF_MANY, COARSER_RAY_COST_OF_MANY, MAX_RAY_COST_OF_MANY = 20, 25, 160
 
 
@@ -59,17 +66,19 @@ class PairAgreement:
     """Number of other images with which each image agrees on each cell of a surface.
 
     textured, untextured : (i, r, c) uint8, images that agree by correlation, and as ground without texture of the same
-    grey value; n_covering : (r, c), images that cover the cell.
+    grey value; clearly : (i, r, c) uint8, images that agree by the correlation that clearly seeing a cell needs;
+    n_covering : (r, c), images that cover the cell.
     """
 
     textured: NDArray[np.uint8]
+    clearly: NDArray[np.uint8]
     untextured: NDArray[np.uint8]
     n_covering: NDArray[np.integer]
 
     @property
     def clearly_seen(self) -> NDArray[np.bool_]:
         """(i, r, c), cells that an image clearly sees."""
-        enough = (self.textured >= min(MIN_AGREEING_TO_SEE, len(self.textured) - 1)).astype(np.uint8)
+        enough = (self.clearly >= min(MIN_AGREEING_TO_SEE, len(self.clearly) - 1)).astype(np.uint8)
         return np.stack([cv2.morphologyEx(mask, cv2.MORPH_OPEN, MIN_SEEN_SHAPE) for mask in enough]) > 0
 
     @property
@@ -129,7 +138,10 @@ def pair_agreement(grey: Iterable[NDArray[np.float32]], covering: NDArray[np.boo
     deviations, 0 where they do not cover it; covering : (i, r, c) bool, where an image covers that surface.
     """
     images = [_BoxedImage.of(image, shows) for image, shows in zip(grey, covering, strict=True)]
-    textured, untextured = np.zeros(covering.shape, np.uint8), np.zeros(covering.shape, np.uint8)
+    textured, clearly, untextured = (np.zeros(covering.shape, np.uint8) for _ in range(3))
+    to_see, at_height = np.float32(MIN_NCC), np.float32(MIN_NCC)
+    if len(images) == PAIR:
+        to_see, at_height = np.float32(MIN_NCC_TO_SEE_OF_PAIR), np.float32(MIN_NCC_AT_HEIGHT_OF_PAIR)
     for i, j in combinations(range(len(images)), 2):
         box = _shared(images[i].box, images[j].box)
         if box[0].start >= box[0].stop or box[1].start >= box[1].stop:
@@ -137,13 +149,13 @@ def pair_agreement(grey: Iterable[NDArray[np.float32]], covering: NDArray[np.boo
         first, second = images[i].part(box), images[j].part(box)
         apart = np.abs(first.grey - second.grey)
         ncc = (_mean(first.grey * second.grey) - first.mean * second.mean) * (first.inverse * second.inverse)
-        is_alike = (ncc > np.float32(MIN_NCC)) & (apart < np.float32(MAX_GREY_DIFFERENCE))
-        agree = is_alike & first.is_covered & second.is_covered
+        is_alike = first.is_covered & second.is_covered & (apart < np.float32(MAX_GREY_DIFFERENCE))
         both_plain = first.is_plain & second.is_plain & (apart < np.float32(MAX_DEVIATION_WITHOUT_TEXTURE))
         for view in (i, j):
-            textured[view][box] += agree
+            textured[view][box] += is_alike & (ncc > at_height)
+            clearly[view][box] += is_alike & (ncc > to_see)
             untextured[view][box] += both_plain
-    return PairAgreement(textured, untextured, covering.sum(axis=0, dtype=np.int32))
+    return PairAgreement(textured, clearly, untextured, covering.sum(axis=0, dtype=np.int32))
 
 
 def _box_around(mask: NDArray[np.bool_]) -> Part:
@@ -206,25 +218,34 @@ def add_costs_of_rays(
     visible: VisibleHeights,
     height: NDArray[np.float32],
     level: int,
+    step_cells: float,
 ) -> bool:
     """Add to the costs of heights that obstruct free rays; returns whether there are such rays.
 
     cost : (v,) uint8, the cost volume, changed; tile_views : projections of level indices; slope_surface : from which
     the heights of the volume are counted; visible : slope indices; height : (r, c) float32, the heights found, slope
-    indices; level : 0 is the finest.
+    indices; level : 0 is the finest; step_cells : height step divided by the side of a cell, the same at all levels.
     """
     highest = float((lattice.first + lattice.count).max()) + float(slope_surface.cells.max())
     rays = free_rays(tile_views, height + slope_surface.cells, covers_at(visible, height), highest)
     if not np.isfinite(rays).any():
         return False
-    rays += np.float32(COARSER_MARGIN_STEPS if level else MARGIN_STEPS)
+    rays += np.float32(margin_above_ray(level, step_cells))
     ray_cost, max_cost = costs_of_ray(level, usual_number(visible, ALL))
     add_ray_costs(rays, slope_surface.cells, lattice.layout, ray_cost, max_cost, cost)
     return True
 
 
+def margin_above_ray(level: int, step_cells: float) -> float:
+    """Steps by which a height must stand above a ray to obstruct it. step_cells : see `add_costs_of_rays`."""
+    steps, sides = (COARSER_MARGIN_STEPS, COARSER_MARGIN_SIDES) if level else (MARGIN_STEPS, MARGIN_SIDES)
+    return min(steps, sides / step_cells)
+
+
 def costs_of_ray(level: int, n_covering: float) -> tuple[int, int]:
     """Cost of a height for each ray that it obstructs, and the largest cost, where so many views cover the cells."""
+    if n_covering <= PAIR:
+        return RAY_COST_OF_PAIR, MAX_RAY_COST
     if n_covering < MANY_VIEWS:
         return (COARSER_RAY_COST if level else RAY_COST), MAX_RAY_COST
     return (COARSER_RAY_COST_OF_MANY if level else RAY_COST_OF_MANY), MAX_RAY_COST_OF_MANY

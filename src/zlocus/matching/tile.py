@@ -457,7 +457,7 @@ def semiglobal_heights(
     if search.smooth is None:
         return heights
     has_rays = add_costs_of_rays(
-        cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number
+        cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number, step_cells
     )
     if is_evidence:
         of_patch = misfit(cost, search.lattice, heights)
