@@ -29,7 +29,15 @@ from zlocus.synthetic.drone_block import (
     small_drone_block_spec,
     written_cameras,
 )
-from zlocus.synthetic.drone_ground import CAR, PAVEMENT, TARGET_BLACK_PX, TARGET_WHITE_PX, ColouredGround
+from zlocus.synthetic.drone_ground import (
+    CAR,
+    PAVEMENT,
+    PLOT_M,
+    TARGET_BLACK_PX,
+    TARGET_WHITE_PX,
+    ColouredGround,
+    n_plots,
+)
 from zlocus.synthetic.drone_photo import DronePhoto, SplinedRays, seen_colours
 from zlocus.synthetic.drone_truth import n_frames_showing
 from zlocus.synthetic.render import Sun, render, sunlit, visible_ground_points
@@ -454,3 +462,14 @@ def test_the_command_renders_a_small_block(tmp_path: Path) -> None:
 
     assert main(["--kind", "small-drone", "--seed", "3", "-o", str(tmp_path / "block")]) == 0
     assert len(open_scene([tmp_path / "block" / "scene.yaml"]).views) == 6
+
+
+@pytest.mark.parametrize("angle", [-0.12, -0.03, 0.0, 0.12])
+@pytest.mark.parametrize("side_m", [60.0, 700.0, 3000.0])
+def test_plots_cover_the_corners_of_the_ground(side_m, angle):
+    n = n_plots(side_m, side_m, angle)
+    for x, y in ((0.0, 0.0), (side_m, 0.0), (0.0, side_m), (side_m, side_m)):
+        across = (np.cos(angle) * x + np.sin(angle) * y) / PLOT_M[0] + n / 2
+        along = (np.cos(angle) * y - np.sin(angle) * x) / PLOT_M[1] + n / 2
+        assert 0 <= across <= n
+        assert 0 <= along <= n

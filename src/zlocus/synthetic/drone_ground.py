@@ -227,11 +227,20 @@ def _drawn_roads(site: _Site) -> list[_Road]:
     return roads
 
 
+def n_plots(height_m: float, width_m: float, angle: float) -> int:
+    """Number of plots along each side of a rotated raster of plots that covers the ground from its middle on."""
+    usual = int(2 * max(height_m, width_m) / min(PLOT_M)) + 4
+    corners = [(x, y) for x in (0.0, width_m) for y in (0.0, height_m)]
+    across = max(abs(np.cos(angle) * x + np.sin(angle) * y) / PLOT_M[0] for x, y in corners)
+    along = max(abs(np.cos(angle) * y - np.sin(angle) * x) / PLOT_M[1] for x, y in corners)
+    return max(usual, 2 * int(np.ceil(max(across, along))))
+
+
 def _lay_out(site: _Site, roads: list[_Road], angle: float) -> None:
     """Paint gardens in rotated rectangles with hedges between some of them, and roads with pavements over them."""
     ground, rng = site.ground, site.rng
     rows, cols = ground.heights.shape
-    extent = int(2 * max(rows, cols) * ground.step / min(PLOT_M)) + 4
+    extent = n_plots(rows * ground.step, cols * ground.step, angle)
     plots = rng.choice(N_GARDENS, (extent, extent), p=SHARE_OF_GARDENS).astype(np.uint16)
     hedges = rng.random((2, extent, extent)) < SHARE_OF_HEDGES
     x = np.asarray((np.arange(cols) + 0.5) * ground.step)
