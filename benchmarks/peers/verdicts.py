@@ -17,7 +17,7 @@ LOST = 0.01
 # Why zlocus loses a class of cells, as experiments with its stages have shown.
 REASONS = {
     "road": "even and saturated roads have match curves of noise, and the sum over paths takes them as evidence",
-    "tree": "crowns look different in each image, and gross errors of the coarse levels stay inside the search range",
+    "tree": "crowns look different in each image, so that the ground below fits about as well, and jumps cost more",
     "field": "rows of crops repeat, and a wrong repetition costs as little as the right one",
     "building": "roofs without texture take the height that noise gives them",
     "ground": "the search range is wide, so that noise finds false heights far away",

@@ -10,6 +10,7 @@ import pytest
 from rendered_scenes import read, rendered, run
 from zlocus.core.options import CheckOptions, RunConfig
 from zlocus.matching.quality import Quality
+from zlocus.matching.surface import max_sigma_m
 
 
 @pytest.mark.parametrize("method", ["mvll-sgm", "gc3-sgm"])
@@ -37,3 +38,19 @@ def test_removed_heights_can_be_interpolated(tmp_path):
     both = (quality & (Quality.IMPRECISE | Quality.FILLED)) == Quality.IMPRECISE | Quality.FILLED
     assert both.any()
     assert np.isfinite(height[both]).all()
+
+
+@pytest.mark.parametrize(
+    ("given_m", "method", "limit_m"),
+    [
+        (None, "mvll-sgm", 20.0),
+        (None, "mvll", None),
+        (None, "gc3", None),
+        (None, "gc3-sgm", None),
+        (1.5, "mvll-sgm", 1.5),
+        (1.5, "mvll", 1.5),
+        (1.5, "gc3-sgm", 1.5),
+    ],
+)
+def test_without_a_limit_heights_have_one_under_the_semiglobal_constraint(given_m, method, limit_m):
+    assert max_sigma_m(CheckOptions(max_sigma_m=given_m), method, cell_m=0.5) == limit_m

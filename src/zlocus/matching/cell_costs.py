@@ -29,6 +29,7 @@ from zlocus.matching.occlusion import PAIR, covers, sees
 from zlocus.matching.pair_labels import PairLabels
 from zlocus.matching.prior_costs import costs_of_coarser
 from zlocus.matching.search_range import candidates
+from zlocus.matching.surface import max_sigma_m
 from zlocus.matching.tile import LevelCosts, level_costs, match_all_levels, result_of_costs
 
 # Costs of single pairs have this many steps for a natural unit of evidence: as fine as costs from 0 to 255 allow.
@@ -129,7 +130,8 @@ def match_with_costs(tile: TileInputs) -> MatchedCosts | None:
         slope_surface = costs.search.slope_surface
         known_costs = costs_of_coarser(costs.search.lattice, slope_surface, result.level, coarser, tile.config.pyramid)
     with_planes = result if tile.method == "mvll" else with_planes_of_segments(result, tile.config)
-    surface = refined_surface(tile, with_planes, levels.ground).surface.precise(tile.config.checks.max_sigma_m)
+    max_sigma = max_sigma_m(tile.config.checks, tile.method, tile.match_scene.cell_size)
+    surface = refined_surface(tile, with_planes, levels.ground).surface.precise(max_sigma)
     evidence = _evidence_of(tile, costs)
     return MatchedCosts(tile, result.level, coarser, result, costs, known_costs, evidence, surface.height)
 

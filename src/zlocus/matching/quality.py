@@ -18,7 +18,7 @@ class Quality(IntFlag):
     NO_MATCH = 16  # the images do not agree at any height, or the heights at the edge of the overlap are noise
     FAILED = 32  # the tile could not be processed
     INCONSISTENT = 64  # the height failed the cross-consistency check with the other images (image space only)
-    IMPRECISE = 128  # the standard deviation of the height is larger than checks.max_sigma_m
+    IMPRECISE = 128  # the standard deviation of the height is too large, see checks.max_sigma_m
     WEAK = 256  # the images agree poorly
     AMBIGUOUS = 512  # another height fits nearly as well
     JUMP = 1024  # next to a jump in height
@@ -42,7 +42,7 @@ MEANINGS = {
     Quality.NO_MATCH: "the images do not agree at any height, or the heights at the edge of the overlap are noise",
     Quality.FAILED: "the tile could not be processed",
     Quality.INCONSISTENT: "the height failed the cross-consistency check with the other images (image space only)",
-    Quality.IMPRECISE: "the standard deviation of the height is larger than checks.max_sigma_m",
+    Quality.IMPRECISE: "the standard deviation of the height is too large, see checks.max_sigma_m",
     Quality.WEAK: "the images agree poorly",
     Quality.AMBIGUOUS: "another height fits nearly as well",
     Quality.JUMP: "next to a jump in height",

@@ -10,7 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zlocus.core.grid import CellWindow
+from zlocus.core.options import CheckOptions
 from zlocus.matching.quality import Quality
+
+# Heights with a larger standard deviation, in sides of a cell, are left out under the semi-global constraint where no
+# limit is given: two thirds of them are wrong (docs/development/experiments/uncertain_heights.md).
+MAX_SIGMA_CELLS = 40.0
+
+
+def max_sigma_m(checks: CheckOptions, method: str, cell_m: float) -> float | None:
+    """Largest standard deviation of a height, m, for cells with sides of `cell_m`; None without any limit.
+
+    Where none is given there is a limit under the semi-global constraint only. Heights of single cells are those of the
+    papers, and what is matched in image space is judged later.
+    """
+    if checks.max_sigma_m is not None or method != "mvll-sgm":
+        return checks.max_sigma_m
+    return MAX_SIGMA_CELLS * cell_m
 
 
 @dataclass(frozen=True)
@@ -43,7 +59,7 @@ class Surface:
         return self._emptied(outside, np.where(outside, np.uint16(Quality.OUTSIDE), self.quality))
 
     def precise(self, max_sigma_m: float | None) -> Surface:
-        """The surface without the heights whose standard deviation is larger than a limit; None: no limit."""
+        """The surface without the heights whose standard deviation is larger than a limit, m; None: no limit."""
         if max_sigma_m is None:
             return self
         too_much = self.sigma > max_sigma_m

@@ -68,7 +68,7 @@ from zlocus.matching.semiglobal import (
 )
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.subpixel import smoothed
-from zlocus.matching.surface import Surface
+from zlocus.matching.surface import Surface, max_sigma_m
 from zlocus.matching.tile_candidates import candidates_of_tile, windows_of
 from zlocus.matching.tile_views import TileGrid, TileViews, tile_views
 from zlocus.matching.view_selection import ChosenViews, choose_views
@@ -130,7 +130,7 @@ def match_tile(
     if method != "mvll":
         results[-1] = with_planes_of_segments(results[-1], config)
     refined = refined_surface(tile, results[-1], ground)
-    surface = refined.surface.precise(config.checks.max_sigma_m)
+    surface = refined.surface.precise(max_sigma_m(config.checks, method, match_scene.cell_size))
     if fill == "interpolate":
         surface = filled(surface, config.pyramid.halo // 2)
     surface = replace(surface, ortho=ortho_of_surface(tile, results, surface, refined.lattice_index))
