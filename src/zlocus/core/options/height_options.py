@@ -120,7 +120,7 @@ class CheckOptions(Checked):
     )  # fmt: skip
     max_sigma_m: float | None = option(
         None, "A cell of the surface has no height where its standard deviation is larger. Unset: 40 sides of a cell, "
-        "where two thirds of the heights are wrong; no limit without the semi-global constraint and for depths in image "
-        "space.",
+        "where two thirds of the heights are wrong; no limit without the semi-global constraint, and for depths in "
+        "image space.",
         low=1e-6, high=1e5, unit="m",
     )  # fmt: skip

@@ -30,8 +30,8 @@ DESPITE_PEAK = {
     Quality.OCCLUDED: "match curves do not include occlusions. At the height of the surface fewer than two images see "
     "the cell",
     Quality.INCONSISTENT: "the curve belongs to one reference image, and no other image found the same height",
-    Quality.IMPRECISE: "the peak is high but wide or ambiguous: its standard deviation is larger than checks.max_sigma_m "
-    "or, where that is not set, than 40 sides of a cell",
+    Quality.IMPRECISE: "the peak is high but wide or ambiguous: its standard deviation is larger than "
+    "checks.max_sigma_m or, where that is not set, than 40 sides of a cell",
 }
 HIGH_PEAK = 0.5
 # What the user can do about a flag, where something helps.
