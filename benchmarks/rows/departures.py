@@ -32,7 +32,7 @@ LOSES = "what the papers describe is better than the departure from it"
 @dataclass(frozen=True)
 class Departure:
     """What is changed to take a departure back. options : of the file of options, by section; words : of the command
-    line; patches : functions of zlocus, as module:name, and what each returns instead."""
+    line; patches : functions of zlocus, as `module.name`, and what each returns instead."""
 
     options: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     words: Sequence[str] = ()

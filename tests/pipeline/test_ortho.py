@@ -14,6 +14,7 @@ from ortho_scenes import FOUR_BANDS, PIXEL_M, town, truth_of, write_photo, write
 from rendered_scenes import PART, rendered, run
 from zlocus.cli.app import app
 from zlocus.core.ortho_request import MOSAIC, MOSAIC_IMAGES, ORTHO_RECORD
+from zlocus.pipeline.ortho import complete_or_removed
 from zlocus.synthetic.render import visible_ground_points
 
 OFF_PX = 0.3
@@ -187,3 +188,11 @@ def test_another_result_is_kept(made, of_four_bands):
     again = ortho(made.folder / "surface.tif", made.folder / "d1.tif", "-o", of_four_bands)
     assert again.exit_code == 2
     assert "holds another set of ortho-images" in again.stderr
+
+
+def test_the_styles_of_a_surface_in_the_same_folder_stay(tmp_path):
+    for name in ("ortho.tif", "ortho.qml", "ortho.sld"):
+        (tmp_path / name).write_text("of the surface")
+    with complete_or_removed(tmp_path, []):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ortho.qml", "ortho.sld", "ortho.tif"]

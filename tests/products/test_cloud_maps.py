@@ -13,6 +13,7 @@ from zlocus.core.grid import CellWindow
 from zlocus.io.vertical import ELLIPSOIDAL
 from zlocus.matching.quality import Quality
 from zlocus.products.cloud_maps import ImageMap, pixels_per_metre
+from zlocus.sensors.correction import ShiftedModel
 from zlocus.sensors.frame import FrameModel, rotation_from_angles
 from zlocus.synthetic.cameras import SatelliteCamera
 
@@ -52,6 +53,12 @@ def test_points_lie_on_the_rays_of_their_pixels(tmp_path, is_depth):
     # The empty pixel lies between those that are read, the filled one does not.
     whole = read.read(CellWindow(0, 0, *SHAPE)).points
     assert np.argwhere(np.isnan(whole[..., 0])).tolist() == [[3, 4], [5, 6]]
+
+
+def test_depths_of_a_shifted_frame_camera_tell_which_point_is_nearer(tmp_path):
+    read = image_map(tmp_path, ShiftedModel(FRAME, 0.5, -0.3), np.full(SHAPE, 80.0), True)
+    points = FRAME.ground_at_depth(np.array([[3.0, 4.0], [20.0, 10.0]]), np.array([80.0, 90.0]))
+    np.testing.assert_allclose(read.nearness(points), [-80.0, -90.0], atol=SAME_M)
 
 
 def test_heights_above_a_geoid_become_ellipsoidal(tmp_path):

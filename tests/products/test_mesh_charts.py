@@ -32,6 +32,7 @@ class RampBands:
 
     number: int
     shape: tuple[int, int] = (90, 120)
+    first_valid_col: int = 0
 
     def value(self, xy):
         return 20.0 + 60.0 * self.number + 0.4 * xy[..., 0] + 0.3 * xy[..., 1]
@@ -39,7 +40,7 @@ class RampBands:
     def read(self, row, col, rows, cols):
         y, x = np.mgrid[row : row + rows, col : col + cols].astype(float)
         values = self.value(np.stack([x, y], axis=-1)).astype(np.float32)
-        return BandWindow(values[None], np.ones(values.shape, bool))
+        return BandWindow(values[None], x >= self.first_valid_col)
 
     def displaced(self, xy):
         return xy
@@ -120,3 +121,18 @@ def test_faces_from_behind_and_beyond_the_border_are_not_shown():
     shown = SurfaceViews.of(pixels, np.ones((2, len(quads)), bool), quads, images()).shown
     assert (shown[0] == 0).all()
     assert shown[1].reshape(N, N).any(axis=0).tolist() == [True] * 5 + [False] * (N - 5)
+
+
+def test_pixels_without_a_value_show_nothing():
+    """A part below a mask is shown by the other image, and by none where that has no value either."""
+    vertices, quads = grid()
+    pixels = np.stack([10.0 + 2.0 * vertices, 10.0 + 1.5 * vertices])
+    masked = [
+        SimpleNamespace(bands=RampBands(k, first_valid_col=first), limits=(0.0, 255.0))
+        for k, first in ((0, 22), (1, 13))
+    ]
+    surface_views = SurfaceViews.of(pixels, np.ones((2, len(quads)), bool), quads, masked)
+    chart = charted(masked, surface_views, quads, [1, 1])
+    by_column = best_images(surface_views, quads).reshape(N, N)[0]
+    assert by_column.tolist() == [-1, -1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0]
+    assert chart.texture.min() >= 20

@@ -464,6 +464,23 @@ def test_the_command_renders_a_small_block(tmp_path: Path) -> None:
     assert len(open_scene([tmp_path / "block" / "scene.yaml"]).views) == 6
 
 
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--kind", "small-drone", "--delivery"], "--delivery writes satellite images"),
+        (["--kind", "mixed", "--delivery"], "--delivery writes satellite images"),
+        (["--cameras", "linescan", "--delivery"], "--delivery writes satellite images"),
+        (["--kind", "city", "--projects"], "--projects writes the cameras of a drone block"),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, capsys, arguments, says):
+    from zlocus.synthetic.__main__ import main
+
+    assert main([*arguments, "-o", str(tmp_path / "block")]) != 0
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "block").exists()
+
+
 @pytest.mark.parametrize("angle", [-0.12, -0.03, 0.0, 0.12])
 @pytest.mark.parametrize("side_m", [60.0, 700.0, 3000.0])
 def test_plots_cover_the_corners_of_the_ground(side_m, angle):

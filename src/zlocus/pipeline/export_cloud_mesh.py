@@ -14,7 +14,7 @@ from zlocus.core.export_request import ExportRequest
 from zlocus.core.footprints import Bounds
 from zlocus.core.grid import CellWindow
 from zlocus.core.progress import Progress
-from zlocus.core.sensor_model import FloatArray
+from zlocus.core.sensor_model import FloatArray, bare
 from zlocus.io.staged_export import staged_export
 from zlocus.pipeline.mesh_record import MeshFrame, write_mesh_record, write_mesh_tile
 from zlocus.pipeline.opened_cloud import OpenedCloud, open_cloud
@@ -27,6 +27,7 @@ from zlocus.products.mesh_texture import TextureImage
 from zlocus.products.mesh_tileset import MeshTile
 from zlocus.products.range_fusion import BLOCK, RangeMap, VoxelCube, close_below, fused
 from zlocus.products.voxel_surface import QuadSurface, zero_surface
+from zlocus.sensors.frame import FrameModel
 
 # Nodes along the side of a tile, in whole blocks; fewer where an image would show it on more than so many pixels.
 MAX_TILE_NODES, MIN_TILE_NODES, TILE_PIXELS = 128, 32, 1024
@@ -184,8 +185,8 @@ def _setup(request: ExportRequest, opened_cloud: OpenedCloud) -> CloudMeshSetup:
 
 
 def _density(image_map: ImageMap) -> float:
-    """Pixels of an image that a metre across its rays spans, in the middle of what it shows; NaN where that is
-    nothing."""
+    """Median number of pixels per metre of what an image shows, perpendicular to its rays; NaN where its map has no
+    height."""
     rows, cols = image_map.shape
     found = []
     for row in np.unique(np.linspace(0, rows - 1, SAMPLED_ROWS).astype(int)):
@@ -231,7 +232,14 @@ def _tiles(setup: CloudMeshSetup, columns: dict[tuple[int, int], tuple[float, fl
             merged[x // n, y // n] = min(known[0], ends[0]), max(known[1], ends[1])
         tiles = [ColumnTile(x, y, n * MIN_TILE_NODES, *setup.nodes_between(*ends)) for (x, y), ends in merged.items()]
         tiles = [tile for tile in tiles if setup.bounds is None or tile.meets(setup.bounds, setup.cell_m)]
-        if n == 1 or max((tile.n_nodes for tile in tiles), default=0) <= MAX_NODES:
+        largest = max(tiles, key=lambda tile: tile.n_nodes, default=None)
+        if largest is not None and n == 1 and largest.n_nodes > MAX_NODES:
+            low_m, high_m = merged[largest.x, largest.y]
+            raise GeometryError(
+                f"A part of the mesh reaches from {low_m:.0f} to {high_m:.0f} m, which is too high for its resolution "
+                f"of {setup.cell_m:g} m. Give a larger --resolution, or --bounds without what lies far away."
+            )
+        if n == 1 or largest is None or largest.n_nodes <= MAX_NODES:
             return sorted(tiles, key=lambda tile: (-tile.y, tile.x))
         n //= 2
 
@@ -306,8 +314,16 @@ def _window_of(image_map: ImageMap, box: FloatArray, margin: int) -> CellWindow 
     known = np.isfinite(xy).all(axis=1)
     if not known.any():
         return None
-    # A camera that has a part of the box behind it may see the rest anywhere.
-    low, high = (xy.min(axis=0), xy.max(axis=0)) if known.all() else (np.zeros(2), np.array([cols, rows]) - 1.0)
+    low, high = xy[known].min(axis=0), xy[known].max(axis=0)
+    if not known.all():
+        # Beyond the disc in which a lens is one to one a point has no pixel. The edge of the disc lies between two
+        # points of the box. A camera that has a part of the box behind it may see the rest anywhere.
+        sensor = bare(image_map.view.sensor)
+        if isinstance(sensor, FrameModel) and bool((sensor.depth(box) > 0).all()):
+            spacing = (high - low) / max(known.sum() ** (1 / 3) - 1.0, 1.0)
+            low, high = low - spacing, high + spacing
+        else:
+            low, high = np.zeros(2), np.array([cols, rows]) - 1.0
     left, top = np.clip(np.floor(low).astype(np.int64) - margin, 0, [cols, rows])
     right, bottom = np.clip(np.ceil(high).astype(np.int64) + margin + 1, 0, [cols, rows])
     if left >= right or top >= bottom:

@@ -133,9 +133,9 @@ def complete_or_removed(out: Path, paths: Sequence[Path]) -> Iterator[None]:
 
 
 def _remove(out: Path, names: Sequence[str]) -> None:
-    """Remove files with their styles."""
+    """Remove files with their styles. The record has none: `ortho.qml` is the style of a surface's `ortho.tif`."""
     remove_earlier(out, names)
-    remove_styles(out, names)
+    remove_styles(out, [name for name in names if Path(name).suffix == ".tif"])
 
 
 def earlier_files(out: Path) -> list[str]:

@@ -13,7 +13,7 @@ from rasterio.windows import Window
 
 from zlocus.core.grid import CellWindow
 from zlocus.core.scene import View
-from zlocus.core.sensor_model import FloatArray
+from zlocus.core.sensor_model import FloatArray, bare
 from zlocus.io.open_raster import cached_raster
 from zlocus.io.vertical import VerticalDatum
 from zlocus.matching.quality import Quality
@@ -75,8 +75,9 @@ class ImageMap:
         return RayPoints(points, towards)
 
     def nearness(self, ground: FloatArray) -> FloatArray:
-        """Numbers (n,) m of ground points (n, 3), of which a larger one is nearer to the camera on its ray."""
-        sensor = self.view.sensor
+        """Values (n,) m of ground points (n, 3) m that increase towards the camera along a ray: minus the depth of
+        frame cameras, else the height."""
+        sensor = bare(self.view.sensor)
         return -sensor.depth(ground) if isinstance(sensor, FrameModel) else ground[:, 2]
 
     def _ground(self, xy: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,7 +87,8 @@ class ImageMap:
             assert isinstance(sensor, FrameModel), "only frame cameras have depths"
             return sensor.ground_at_depth(xy, values), sensor.ground_at_depth(xy, values * (1.0 - NEARER_SHARE))
         if self.vertical_datum.geoid is not None:
-            # The undulation is that of the point's place, which depends on its height by far less than a millimetre.
+            # The undulation is that of the place at the height above the geoid taken as ellipsoidal: some metres beside
+            # it, where it differs by a few millimetres at most.
             place = sensor.ground_from_image(xy, values)
             values = values + self.vertical_datum.undulation(place[:, :2], self.crs)
         return sensor.ground_from_image(xy, values), sensor.ground_from_image(xy, values + HIGHER_M)
@@ -98,7 +100,8 @@ class ImageMap:
 
 
 def pixels_per_metre(view: View, points: FloatArray) -> FloatArray:
-    """How many pixels of a view a metre across its ray spans at ground points (n, 3) m: (n,)."""
+    """Pixels per metre (n,) of a view at ground points (n, 3) m, for lengths perpendicular to the ray: the geometric
+    mean of two directions."""
     steps = np.concatenate([np.eye(3), -np.eye(3)]) / 2
     at = [view.sensor.image_from_ground(points + step) for step in steps]
     along_x, along_y = (np.stack([at[k][:, i] - at[k + 3][:, i] for k in range(3)], axis=-1) for i in range(2))

@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from zlocus.core.sensor_model import FloatArray
-from zlocus.products.mesh_texture import GREY, MAX_TEXTURE_ROWS, MIN_GAIN, TextureImage
+from zlocus.products.mesh_texture import GREY, MAX_TEXTURE_ROWS, MIN_GAIN, TextureImage, has_value
 from zlocus.products.ortho_images import stored
 from zlocus.sensors.ground_sampling import sampled
 
@@ -55,7 +55,9 @@ class SurfaceViews:
             following = np.roll(xy, -1, axis=1)
             # Outlines are counter-clockwise from outside, and rows of images grow downwards.
             area = -0.5 * (xy[..., 0] * following[..., 1] - following[..., 0] * xy[..., 1]).sum(axis=1)
-            shown[number] = np.where(inside & is_seen[number], np.maximum(area, 0.0), 0.0)
+            may_show = np.flatnonzero(inside & is_seen[number] & (area > 0.0))
+            may_show = may_show[has_value(image, xy[may_show].mean(axis=1))]
+            shown[number, may_show] = area[may_show]
         return cls(pixels, shown)
 
 
@@ -214,6 +216,7 @@ def _texture(
             continue
         low, high = image.limits
         scaled = (np.moveaxis(found.values, 0, -1) - low) * (255.0 / (high - low))
+        scaled = np.where(found.valid[..., None], scaled, float(GREY))
         for k in mine:
             (left, top), (width, height) = charts.low[k] - BORDER * n - start, size[k]
             part = scaled[top : top + height * n, left : left + width * n]

@@ -157,7 +157,8 @@ def best_image(
         wanted = np.flatnonzero(shown[number] > gain * area)
         chosen = None if outwards is None else outwards[wanted]
         wanted = wanted[is_seen(images[number].sensor, samples[wanted], chosen, window)]
-        wanted = wanted[_has_value(images[number], samples[wanted].mean(axis=1), window)]
+        middle = window.ground(samples[wanted].mean(axis=1))
+        wanted = wanted[has_value(images[number], images[number].sensor.image_from_ground(middle))]
         best[wanted], area[wanted] = number, shown[number, wanted]
     return best
 
@@ -174,16 +175,16 @@ def _pixels(image: TextureImage, outlines: FloatArray, window: SurfaceWindow) ->
     return np.where(inside, np.maximum(shown, 0.0), 0.0)
 
 
-def _has_value(image: TextureImage, points: FloatArray, window: SurfaceWindow) -> NDArray[np.bool_]:
-    """Whether an image has a value at points (k, 3), in cells and m: none lies beyond its edge or below its mask."""
-    if not len(points):
+def has_value(image: TextureImage, xy: FloatArray) -> NDArray[np.bool_]:
+    """Whether an image has a value at pixels (k, 2), as column and row: none lies beyond its edge or below its mask."""
+    if not len(xy):
         return np.zeros(0, bool)
     # In rows, because a picture may not be as wide as there are points.
-    places = np.full((-(-len(points) // ROW_OF_POINTS) * ROW_OF_POINTS, 2), np.nan)
-    places[: len(points)] = image.sensor.image_from_ground(window.ground(points))
+    places = np.full((-(-len(xy) // ROW_OF_POINTS) * ROW_OF_POINTS, 2), np.nan)
+    places[: len(xy)] = xy
     rows = image.bands.displaced(places.reshape(-1, ROW_OF_POINTS, 2))
     found = sampled(image.bands.read, image.bands.shape, rows)
-    return np.zeros(len(points), bool) if found is None else found.valid.ravel()[: len(points)]
+    return np.zeros(len(xy), bool) if found is None else found.valid.ravel()[: len(xy)]
 
 
 def _patch_samples(patches: CellPatches) -> FloatArray:

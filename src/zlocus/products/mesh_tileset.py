@@ -29,7 +29,8 @@ MIN_SIDE_M = 0.01
 @dataclass(frozen=True)
 class MeshTile:
     """A tile that was written. file : its name; low, high : (3,) m, corners of its box in the frame of all tiles (east,
-    north, up from the origin of the mesh); n_triangles, n_walls, n_unseen : counts of it."""
+    north, up from the origin of the mesh); n_triangles : of the tile; n_walls : walls of a surface's
+    mesh, or faces of a cloud's mesh that are as steep as walls; n_unseen : faces that no image shows."""
 
     file: str
     low: tuple[float, float, float]

@@ -20,12 +20,12 @@ from zlocus.products.cloud_maps import ImageMap, RayPoints
 
 # Neighbouring pixels belong to one surface where it is seen at less than this tangent of an angle from its normal.
 MAX_SLANT = 5.0
-# Weight below which a voxel counts as unknown.
+# Weight below which a node counts as unknown.
 MIN_WEIGHT = 0.05
-# Columns so many nodes away are nearby.
+# Two columns of nodes are neighbours up to this distance, nodes.
 NEARBY_NODES = 2
-# Voxels along the side of the blocks that lie near a surface or do not, and at most so many are looked up at once.
-BLOCK, VOXELS_AT_ONCE = 8, 200_000
+# Nodes along the side of a block: only blocks near a surface are computed. And nodes that are projected at once.
+BLOCK, NODES_AT_ONCE = 8, 200_000
 
 
 @dataclass(frozen=True)
@@ -135,16 +135,19 @@ def fused(range_maps: list[RangeMap], cube: VoxelCube, band_m: float) -> NDArray
     band's end, because there may be another surface, which it does not see.
     """
     values = np.full(cube.shape, np.nan, np.float32)
-    measure(values, cube.nodes_near(range_maps, band_m), range_maps, cube, band_m)
+    set_distances(values, cube.nodes_near(range_maps, band_m), range_maps, cube, band_m)
     return values
 
 
-def measure(
+def set_distances(
     values: NDArray[np.float32], nodes: NDArray[np.int64], range_maps: list[RangeMap], cube: VoxelCube, band_m: float
 ) -> None:
-    """Set the values of some nodes, given by their flat numbers, as `fused` has them; changes the array."""
-    for first in range(0, len(nodes), VOXELS_AT_ONCE):
-        part = nodes[first : first + VOXELS_AT_ONCE]
+    """Set the signed distances of some nodes, as `fused` defines them.
+
+    values : float32 of the cube's shape, changed in place; nodes : (n,) flat numbers.
+    """
+    for first in range(0, len(nodes), NODES_AT_ONCE):
+        part = nodes[first : first + NODES_AT_ONCE]
         xyz = cube.ground(part)
         total, weight = np.zeros(len(part)), np.zeros(len(part))
         for one in range_maps:
@@ -174,7 +177,7 @@ def close_below(values: NDArray[np.float32], range_maps: list[RangeMap], cube: V
     high = cv2.dilate(np.where(any_inside, top, np.float32(-n)), kernel)[..., None]
     height = np.arange(n)
     between = np.isnan(values) & (height > low) & (height <= high + NEARBY_NODES)
-    measure(values, np.flatnonzero(between), range_maps, cube, band_m)
+    set_distances(values, np.flatnonzero(between), range_maps, cube, band_m)
     above = np.full(values.shape[:2], np.nan, np.float32)  # -1 solid, 1 free
     for level in range(n - 1, -1, -1):
         layer = values[:, :, level]

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zlocus.core.errors import ZlocusError
+from zlocus.core.errors import ConfigError, ZlocusError
 
 if TYPE_CHECKING:
     from zlocus.synthetic.scenes import SceneSpec
@@ -26,6 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     given = _parser().parse_args(arguments)
     try:
+        _check(given)
         if given.kind == "mixed":
             render_mixed_scene(_spec(given), given.output, _say)
         elif given.kind in ("drone", "small-drone"):
@@ -44,6 +45,17 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return error.exit_status
     return 0
+
+
+def _check(given: argparse.Namespace) -> None:
+    """Refuse options that would have no effect."""
+    is_drone = given.kind in ("drone", "small-drone")
+    if given.delivery and (is_drone or given.kind == "mixed" or given.cameras == "linescan"):
+        raise ConfigError(
+            "--delivery writes satellite images with RPCs. Leave it out, or choose another --kind and --cameras rpc."
+        )
+    if given.projects and not is_drone:
+        raise ConfigError("--projects writes the cameras of a drone block. Add --kind small-drone, or leave it out.")
 
 
 def _say(step: str) -> None:

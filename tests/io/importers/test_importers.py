@@ -224,7 +224,7 @@ def test_an_offset_leads_from_the_model_to_the_map(kind, tmp_path):
     assert [name for name, importer in IMPORTERS.items() if "offset" in importer.options] == list(LOCAL_ON_A_MAP)
     written = getattr(files, f"write_{kind}")(tmp_path / "p")
     options = LOCAL_ON_A_MAP[kind] | {"crs": "EPSG:32632"}
-    with pytest.warns(ZlocusWarning, match=r"Give with --offset what was subtracted"):
+    with pytest.warns(ZlocusWarning, match=r"Give what was subtracted from the coordinates of the map with --offset"):
         there = imported(kind, written, **options)
     here = imported(kind, written, offset=OFFSET, **options)
     for one, other in zip(there.views, here.views, strict=True):

@@ -78,5 +78,7 @@ def _outside(centres: FloatArray, crs: CRS, has_offset: bool) -> str | None:
     is_along = (lon - area.west + BEYOND_DEG) % 360.0 <= width + 2 * BEYOND_DEG
     if is_along and area.south - BEYOND_DEG <= lat <= area.north + BEYOND_DEG:
         return None
-    advice = "Check --offset and --crs" if has_offset else "Give with --offset what was subtracted from the map's"
+    advice = "Give what was subtracted from the coordinates of the map with --offset"
+    if has_offset:
+        advice = "Check --offset and --crs"
     return f"which is outside the area in which {crs.to_string()} is used. {advice}."
