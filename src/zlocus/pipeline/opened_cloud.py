@@ -3,7 +3,7 @@ pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from zlocus.core.errors import InputError, ZlocusError
 from zlocus.core.progress import Progress, SilentProgress
 from zlocus.core.requests import CloudRequest, SetupRequest
 from zlocus.io.open_raster import open_raster
-from zlocus.io.run_record import read_record
+from zlocus.io.run_record import inputs_record, read_record
 from zlocus.matching.image_space import is_by_depth
 from zlocus.pipeline.image_scenes import set_up_images
 from zlocus.pipeline.recorded_run import config_of, folder_of, request_with
@@ -56,11 +56,12 @@ def open_cloud(folder: Path, progress: Progress) -> OpenedCloud:
     Raises
     ------
     InputError
-        A map is missing or of another image, or the cameras of the run cannot be restored.
+        A map is missing or of another image, an input has changed, or the cameras of the run cannot be restored.
     """
     run = read_record(folder / RECORD)
     base = folder_of(folder, run)
     try:
+        _check_inputs(base, run["inputs"])
         others = {"out": folder, "overwrite": False}
         request = request_with(folder / RECORD, run, CloudRequest, lambda path: base / path, others)
         opened = open_inputs(SetupRequest.of(request), SilentProgress(), "later")
@@ -85,6 +86,15 @@ def open_cloud(folder: Path, progress: Progress) -> OpenedCloud:
             _check_map(each, view.image.shape, view.name)
         image_maps.append(ImageMap(view, path, quality_path, is_depth, opened.vertical_datum, setup.scene.crs))
     return OpenedCloud(folder, setup.scene.crs, image_maps, steps)
+
+
+def _check_inputs(base: Path, recorded: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse inputs that are not those of the cloud. base : where relative paths begin; recorded : see
+    `inputs_record`. Missing files are named where they are read."""
+    for record in recorded:
+        path = base / record["path"]
+        if record["sha256"] and path.is_file() and inputs_record([path])[0]["sha256"] != record["sha256"]:
+            raise InputError(f"{path} has changed since the cloud was made")
 
 
 def _check_map(path: Path, shape: tuple[int, int], name: str) -> None:
