@@ -23,7 +23,7 @@ REASONS = {
     "ground": "the search range is wide, so that noise finds false heights far away",
 }
 PLURALS = {"road": "roads", "tree": "trees", "field": "fields", "building": "roofs", "ground": "ground"}
-GROSS = "gross errors of cells that the images say nothing about: no height is refused there"
+GROSS = "gross errors of cells that no two images see, at heights where the images agree on what lies elsewhere"
 SEED_SCENE = re.compile(r"^realistic \d+, (\d) views$")
 MEAN_SCENE = "realistic scenes of {n} fresh seeds, {views} views"
 
