@@ -86,7 +86,7 @@ def _known_ortho(result: LevelResult, lattice_index: NDArray[np.float32], view: 
 
 def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> RefinedSurface:
     """Refine the heights of the finest level, halo included, check them, and estimate their precision."""
-    measured_heights = _measure(tile, result, ground)
+    measured_heights = _single_cell_heights(tile, result, ground)
     lattice_index, quality = measured_heights.lattice_index, measured_heights.quality
     if tile.method != "mvll":
         lattice_index = _smoothed(tile, result, measured_heights)
@@ -99,7 +99,7 @@ def refined_surface(tile: TileInputs, result: LevelResult, ground: OverlapGround
     return RefinedSurface(surface, lattice_index)
 
 
-def _measure(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> MeasuredHeights:
+def _single_cell_heights(tile: TileInputs, result: LevelResult, ground: OverlapGround) -> MeasuredHeights:
     """Refine the heights of single cells, check them, and estimate their precision."""
     match_scene, config = tile.match_scene, tile.config
     splines, layout = np.empty_like(result.tile_views.pixels), result.tile_views.layout

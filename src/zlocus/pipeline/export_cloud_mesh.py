@@ -29,6 +29,8 @@ from zlocus.products.range_fusion import BLOCK, RangeMap, VoxelCube, close_below
 from zlocus.products.voxel_surface import QuadSurface, zero_surface
 from zlocus.sensors.frame import FrameModel
 
+# Of fewer points of a box with a pixel the window that shows the box is not told.
+MIN_KNOWN_POINTS = 8
 # Nodes along the side of a tile, in whole blocks; fewer where an image would show it on more than so many pixels.
 MAX_TILE_NODES, MIN_TILE_NODES, TILE_PIXELS = 128, 32, 1024
 # Nodes of a tile with all its heights and those around it: tall ones are narrower.
@@ -319,7 +321,8 @@ def _window_of(image_map: ImageMap, box: FloatArray, margin: int) -> CellWindow 
         # Beyond the disc in which a lens is one to one a point has no pixel. The edge of the disc lies between two
         # points of the box. A camera that has a part of the box behind it may see the rest anywhere.
         sensor = bare(image_map.view.sensor)
-        if isinstance(sensor, FrameModel) and bool((sensor.depth(box) > 0).all()):
+        is_in_front = isinstance(sensor, FrameModel) and bool((sensor.depth(box) > 0).all())
+        if is_in_front and known.sum() >= MIN_KNOWN_POINTS:
             spacing = (high - low) / max(known.sum() ** (1 / 3) - 1.0, 1.0)
             low, high = low - spacing, high + spacing
         else:
