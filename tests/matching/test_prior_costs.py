@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from affine import Affine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernel_scene import ragged_lattice
 from reference.semiglobal import dense
+from zlocus.core.grid import CellWindow
+from zlocus.core.options import SemiGlobalOptions
 from zlocus.matching.kernels.prior_costs import (
     CoarserCells,
     DistanceCost,
@@ -16,6 +19,7 @@ from zlocus.matching.kernels.prior_costs import (
     add_costs_of_candidates,
     write_misfit,
 )
+from zlocus.matching.level_records import PyramidLevel
 from zlocus.matching.prior_costs import (
     FREE_SIDES,
     FREE_STEPS,
@@ -23,7 +27,11 @@ from zlocus.matching.prior_costs import (
     LEAST_PENALTY,
     cost_beyond,
     penalties_after_misfit,
+    penalties_of_agreement,
+    share_at_least_cost,
+    smaller_penalties,
 )
+from zlocus.matching.semiglobal import SemiGlobalHeights
 
 SHAPE, BLOCK = (13, 22), 8
 BY_DISTANCE = DistanceCost(np.float32(3.0), np.float32(5.0), np.float32(30.0))
@@ -93,6 +101,54 @@ def test_misfit_is_the_cost_above_the_least():
     all_costs = dense(cost, lattice, np.inf)
     expected = np.take_along_axis(all_costs, height[..., None].astype(int), axis=2)[..., 0] - all_costs.min(axis=2)
     np.testing.assert_array_equal(found, np.where(is_wanted, expected, 0))
+
+
+def test_the_share_at_least_cost_is_that_of_cells_within_a_step_of_their_minimum():
+    cost, lattice, _ = volume(8)
+    rng = np.random.default_rng(9)
+    first, count = lattice.cell_ranges()
+    least = dense(cost, lattice, np.inf).argmin(axis=2)
+    best = np.clip(least + rng.integers(-3, 4, SHAPE), first, first + count - 1).astype(np.int32)
+    core = (slice(2, 11), slice(3, 20))
+    n_near = sum(abs(int(best[r, c]) - int(least[r, c])) <= 1 for r in range(2, 11) for c in range(3, 20))
+    assert share_at_least_cost(cost, lattice, heights_at(best), core) == pytest.approx(n_near / (9 * 17))
+    assert 0.2 < n_near / (9 * 17) < 0.8
+    assert share_at_least_cost(cost, lattice, heights_at(best), (slice(0, 0), slice(0, 0))) == 0.0
+
+
+def test_a_height_that_costs_as_little_as_another_one_counts_as_least():
+    cost, lattice, _ = volume(8)
+    first, count = lattice.cell_ranges()
+    cost[:] = 7
+    best = (first + count - 1).astype(np.int32)
+    assert share_at_least_cost(cost, lattice, heights_at(best), (slice(None), slice(None))) == 1.0
+
+
+def heights_at(best):
+    zero = np.zeros(SHAPE, np.uint16)
+    return SemiGlobalHeights(best, best, zero, best.astype(np.float32))
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.0, 1.0), (0.7, 1.0), (0.825, 0.75), (0.95, 0.5), (1.0, 0.5)])
+def test_jumps_are_cheaper_the_more_cells_the_costs_alone_find(share, factor):
+    found = smaller_penalties(np.full((4, 3, 5), 400, np.uint16), share, 45.0)
+    assert (found == round(400 * factor)).all()
+
+
+def test_no_penalty_falls_below_that_of_an_edge():
+    penalties = np.array([0, 10, 45, 46, 90, 400], np.uint16).reshape(1, 1, 6).repeat(4, axis=0)
+    np.testing.assert_array_equal(smaller_penalties(penalties, 1.0, 45.0)[0, 0], [0, 10, 45, 45, 45, 200])
+
+
+def test_a_given_p2_stays():
+    cost, lattice, _ = volume(8)
+    heights = heights_at(dense(cost, lattice, np.inf).argmin(axis=2).astype(np.int32))
+    core, transform = (slice(0, SHAPE[0]), slice(0, SHAPE[1])), Affine(1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+    level = PyramidLevel(0, CellWindow(0, 0, *SHAPE), core, transform, 1.0, 0.0, 0.5, 40)
+    penalties = np.full((4, *SHAPE), 400, np.uint16)
+    for p2, expected in ((400, 400), (None, 200)):
+        found = penalties_of_agreement(penalties, cost, lattice, heights, level, SemiGlobalOptions(p2=p2))
+        assert (found == expected).all()
 
 
 def test_jumps_are_cheaper_where_the_surface_contradicts_the_images():

@@ -11,6 +11,9 @@ Misfit
     cells has much lower costs at other heights, the smooth surface contradicts the images: a crown or a roof was
     smoothed away. There jumps become cheaper, and the costs are aggregated once more. Noise alone makes small misfits,
     and a plain road has none, because all heights cost the same there.
+Agreement of the costs with the surface
+    Good images need less smoothing. The larger the share of cells is whose least cost lies at the height found, the
+    lower are all penalties of jumps when the costs are aggregated once more.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zlocus.core.options import PyramidOptions
+from zlocus.core.options import PyramidOptions, SemiGlobalOptions
 from zlocus.matching.expected_heights import expected_heights
 from zlocus.matching.height_lattice import HeightLattice
 from zlocus.matching.kernels.prior_costs import (
@@ -30,9 +33,10 @@ from zlocus.matching.kernels.prior_costs import (
     write_misfit,
 )
 from zlocus.matching.level_records import LevelResult, PyramidLevel
+from zlocus.matching.local_contrast import Part
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.search_range import candidates
-from zlocus.matching.semiglobal import SemiGlobalHeights
+from zlocus.matching.semiglobal import SemiGlobalHeights, least_jump_penalty, winner_takes_all_indices
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.unsupported_patches import heights_of_surroundings
 
@@ -59,6 +63,9 @@ FAR = np.float32(1e6)
 # it is HALVING_MISFIT; one cell counts with MAX_MISFIT at most.
 MISFIT_WINDOW, HALVING_MISFIT, MISFIT_POWER, MAX_MISFIT = (9, 9), 15.0, 3, 40.0
 LEAST_PENALTY = 10
+# Penalties of jumps decrease from the first share of cells whose least cost lies within a step of the height found, to
+# LEAST_FACTOR at the second.
+SHARES, LEAST_FACTOR = (0.7, 0.95), 0.5
 
 
 def costs_of_coarser(
@@ -96,6 +103,45 @@ def misfit(cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalH
     of_cells = np.empty(lattice.shape, np.float32)
     write_misfit(cost, lattice.layout, heights.best, np.ones(lattice.shape, np.bool_), of_cells)
     return np.asarray(cv2.blur(np.minimum(of_cells, np.float32(MAX_MISFIT)), MISFIT_WINDOW))
+
+
+def share_at_least_cost(
+    cost: NDArray[np.uint8], lattice: HeightLattice, heights: SemiGlobalHeights, core: Part
+) -> float:
+    """Share of the cells of `core` whose least cost lies within a step of the height found, from 0 to 1; 0
+    without such cells.
+
+    cost : (v,), see `HeightLattice.layout`, the one that was aggregated; of equal costs the one at the height counts.
+    """
+    at_least_cost = winner_takes_all_indices(cost, lattice, heights.best)
+    is_near = np.abs(at_least_cost[core] - heights.best[core]) <= 1
+    return float(is_near.mean()) if is_near.size else 0.0
+
+
+def penalties_of_agreement(
+    penalties: NDArray[np.uint16],
+    cost: NDArray[np.uint8],
+    lattice: HeightLattice,
+    heights: SemiGlobalHeights,
+    level: PyramidLevel,
+    options: SemiGlobalOptions,
+) -> NDArray[np.uint16]:
+    """Penalties (4, r, c) of jumps, made smaller where the costs alone find the surface in most cells of a tile.
+
+    cost, heights : see `share_at_least_cost`. A P2 that the options set stays.
+    """
+    if options.p2 is not None:
+        return penalties
+    share = share_at_least_cost(cost, lattice, heights, level.core)
+    return smaller_penalties(penalties, share, least_jump_penalty(level.number, options))
+
+
+def smaller_penalties(penalties: NDArray[np.uint16], share: float, least_penalty: float) -> NDArray[np.uint16]:
+    """Penalties of jumps (4, r, c) for a share of cells, see `share_at_least_cost`; those above `least_penalty`, that
+    of a strong edge of the ortho-image, do not fall below it."""
+    factor = np.float32(np.interp(share, SHARES, (1.0, LEAST_FACTOR)))
+    least = np.minimum(penalties, np.uint16(least_penalty))
+    return np.maximum((penalties * factor).astype(np.uint16), least)
 
 
 def penalties_after_misfit(penalties: NDArray[np.uint16], of_patch: NDArray[np.float32]) -> NDArray[np.uint16]:

@@ -77,7 +77,7 @@ def jump_penalties(
     """
     factor = options.penalty_factor_per_level**level
     p2 = value_of(options, "p2") * factor
-    p2_edge = min(value_of(options, "p2_edge"), value_of(options, "p2")) * factor
+    p2_edge = least_jump_penalty(level, options)
     if ortho is None:
         return np.full((PATHS, *shape), p2, np.uint16)
     penalties = np.empty((PATHS, *shape), np.uint16)
@@ -88,6 +88,12 @@ def jump_penalties(
     constants = PenaltyOptions(np.float32(p2), np.float32(p2_edge), unit, PAIR_CONTRAST * unit)
     image_penalties(ortho, has_two_views, edge_weight, constants, penalties)
     return penalties
+
+
+def least_jump_penalty(level: int, options: SemiGlobalOptions) -> float:
+    """Penalty P2 of a level across a strong edge of the ortho-image."""
+    factor = options.penalty_factor_per_level**level
+    return float(min(value_of(options, "p2_edge"), value_of(options, "p2")) * factor)
 
 
 def aggregate(

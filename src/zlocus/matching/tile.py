@@ -57,6 +57,7 @@ from zlocus.matching.prior_costs import (
     costs_of_coarser,
     misfit,
     penalties_after_misfit,
+    penalties_of_agreement,
 )
 from zlocus.matching.search_range import coarsest_prior, prior_from_coarser, reachable_range, table_range
 from zlocus.matching.semiglobal import (
@@ -259,11 +260,8 @@ def match_finer_levels(
     match : matches a level, None: `match_level`.
     """
     match, results, pair_labels = match or match_level, [coarsest_match.result], coarsest_match.pair_labels
-    level, prior, coarsest_number = (
-        coarsest_match.result.level,
-        coarsest_match.prior,
-        coarsest_match.result.level.number,
-    )
+    level, prior = coarsest_match.result.level, coarsest_match.prior
+    coarsest_number = level.number
     for number in range(coarsest_number - 1, -1, -1):
         level = tile.level(number, overlap_window.finer(coarsest_number - number))
         prior = prior_from_coarser(tile, level, results[-1])
@@ -447,8 +445,8 @@ def semiglobal_heights(
 
     Where a surface was known before, the constraint is applied a second time. Heights that stand in free rays of sight
     are more expensive then. n_images : that cells are matched with; is_evidence : whether jumps are cheaper the second
-    time where the surface of the first contradicts the images, see `zlocus.matching.prior_costs`. Break lines hold both
-    times.
+    time, everywhere as far as the costs alone find the surface of the first, and more so where that surface contradicts
+    the images, see `zlocus.matching.prior_costs`. Break lines hold both times.
     """
     options, step_cells = tile.config.semiglobal, tile.match_scene.step_cells
     lines = tile.match_scene.break_lines
@@ -456,6 +454,8 @@ def semiglobal_heights(
     heights = aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
     if search.smooth is None:
         return heights
+    if is_evidence:
+        penalties = penalties_of_agreement(penalties, cost, search.lattice, heights, level, options)
     has_rays = add_costs_of_rays(
         cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number, step_cells
     )

@@ -22,7 +22,12 @@ class SemiGlobalOptions(Checked):
         low=0, high=1000,
     )  # fmt: skip
     p2: int | None = option_by_method(
-        400, 240, "Penalty P2 of a larger height difference where the ortho-image has no edge.", low=1, high=4000
+        400,
+        240,
+        "Penalty P2 of a larger height difference where the ortho-image has no edge. Where it is unset, it "
+        "becomes as low as half where the costs alone find most heights.",
+        low=1,
+        high=4000,
     )
     p2_edge: int | None = option_by_method(
         45, 100, "Penalty P2 across a strong edge of the ortho-image.", low=1, high=4000
