@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from affine import Affine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernel_scene import ragged_lattice
 from reference.semiglobal import dense
-from zlocus.core.grid import CellWindow
 from zlocus.core.options import SemiGlobalOptions
 from zlocus.matching.kernels.prior_costs import (
     CoarserCells,
@@ -19,7 +17,6 @@ from zlocus.matching.kernels.prior_costs import (
     add_costs_of_candidates,
     write_misfit,
 )
-from zlocus.matching.level_records import PyramidLevel
 from zlocus.matching.prior_costs import (
     FREE_SIDES,
     FREE_STEPS,
@@ -27,7 +24,7 @@ from zlocus.matching.prior_costs import (
     LEAST_PENALTY,
     cost_beyond,
     penalties_after_misfit,
-    penalties_of_agreement,
+    penalty_factor,
     share_at_least_cost,
     smaller_penalties,
 )
@@ -129,26 +126,40 @@ def heights_at(best):
     return SemiGlobalHeights(best, best, zero, best.astype(np.float32))
 
 
-@pytest.mark.parametrize(("share", "factor"), [(0.0, 1.0), (0.7, 1.0), (0.825, 0.75), (0.95, 0.5), (1.0, 0.5)])
-def test_jumps_are_cheaper_the_more_cells_the_costs_alone_find(share, factor):
-    found = smaller_penalties(np.full((4, 3, 5), 400, np.uint16), share, 45.0)
-    assert (found == round(400 * factor)).all()
+@pytest.mark.parametrize(("n_of_40", "factor"), [(0, 1.0), (28, 1.0), (33, 0.75), (38, 0.5), (40, 0.5)])
+def test_penalties_are_smaller_the_more_cells_the_costs_alone_find(n_of_40, factor):
+    cost, lattice, heights = costs_that_find(n_of_40)
+    found = penalty_factor(cost, lattice, heights, (slice(0, 4), slice(0, 10)), SemiGlobalOptions())
+    assert found == pytest.approx(factor)
+
+
+def test_a_given_p2_stays():
+    cost, lattice, heights = costs_that_find(40)
+    assert penalty_factor(cost, lattice, heights, (slice(0, 4), slice(0, 10)), SemiGlobalOptions(p2=400)) == 1.0
+
+
+def costs_that_find(n_of_40):
+    """Costs whose minimum is the height found in so many of the first 4 x 10 cells."""
+    cost, lattice, _ = volume(8)
+    best = dense(cost, lattice, np.inf).argmin(axis=2).astype(np.int32)
+    first, count = lattice.cell_ranges()
+    other = np.where(best - first > 2, first, first + count - 1)
+    assert (np.abs(other - best)[:4, :10] > 1).all()
+    is_missed = np.zeros(SHAPE, bool)
+    is_missed[:4, :10] = (np.arange(40) >= n_of_40).reshape(4, 10)
+    return cost, lattice, heights_at(np.where(is_missed, other, best).astype(np.int32))
 
 
 def test_no_penalty_falls_below_that_of_an_edge():
     penalties = np.array([0, 10, 45, 46, 90, 400], np.uint16).reshape(1, 1, 6).repeat(4, axis=0)
-    np.testing.assert_array_equal(smaller_penalties(penalties, 1.0, 45.0)[0, 0], [0, 10, 45, 45, 45, 200])
+    np.testing.assert_array_equal(smaller_penalties(penalties, 0.5, 45.0)[0, 0], [0, 10, 45, 45, 45, 200])
 
 
-def test_a_given_p2_stays():
-    cost, lattice, _ = volume(8)
-    heights = heights_at(dense(cost, lattice, np.inf).argmin(axis=2).astype(np.int32))
-    core, transform = (slice(0, SHAPE[0]), slice(0, SHAPE[1])), Affine(1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-    level = PyramidLevel(0, CellWindow(0, 0, *SHAPE), core, transform, 1.0, 0.0, 0.5, 40)
-    penalties = np.full((4, *SHAPE), 400, np.uint16)
-    for p2, expected in ((400, 400), (None, 200)):
-        found = penalties_of_agreement(penalties, cost, lattice, heights, level, SemiGlobalOptions(p2=p2))
-        assert (found == expected).all()
+def test_the_uniqueness_is_told_in_units_of_the_full_penalties():
+    zero = np.zeros((1, 5), np.int32)
+    heights = SemiGlobalHeights(zero, zero, np.array([[0, 10, 301, 60000, 65535]], np.uint16), zero.astype(np.float32))
+    np.testing.assert_array_equal(heights.with_full_penalties(0.5).uniqueness, [[0, 20, 602, 65534, 65535]])
+    np.testing.assert_array_equal(heights.with_full_penalties(1.0).uniqueness, heights.uniqueness)
 
 
 def test_jumps_are_cheaper_where_the_surface_contradicts_the_images():

@@ -36,7 +36,7 @@ from zlocus.matching.level_records import LevelResult, PyramidLevel
 from zlocus.matching.local_contrast import Part
 from zlocus.matching.match_scene import MatchScene
 from zlocus.matching.search_range import candidates
-from zlocus.matching.semiglobal import SemiGlobalHeights, least_jump_penalty, winner_takes_all_indices
+from zlocus.matching.semiglobal import SemiGlobalHeights, winner_takes_all_indices
 from zlocus.matching.slope_surface import SlopeSurface
 from zlocus.matching.unsupported_patches import heights_of_surroundings
 
@@ -118,30 +118,25 @@ def share_at_least_cost(
     return float(is_near.mean()) if is_near.size else 0.0
 
 
-def penalties_of_agreement(
-    penalties: NDArray[np.uint16],
+def penalty_factor(
     cost: NDArray[np.uint8],
     lattice: HeightLattice,
     heights: SemiGlobalHeights,
-    level: PyramidLevel,
+    core: Part,
     options: SemiGlobalOptions,
-) -> NDArray[np.uint16]:
-    """Penalties (4, r, c) of jumps, made smaller where the costs alone find the surface in most cells of a tile.
-
-    cost, heights : see `share_at_least_cost`. A P2 that the options set stays.
-    """
+) -> float:
+    """Factor of the penalties of jumps, from LEAST_FACTOR to 1: the smaller, the more cells of `core` have their least
+    cost at the heights found. 1 where the options set P2. cost : (v,), see `share_at_least_cost`."""
     if options.p2 is not None:
-        return penalties
-    share = share_at_least_cost(cost, lattice, heights, level.core)
-    return smaller_penalties(penalties, share, least_jump_penalty(level.number, options))
+        return 1.0
+    return float(np.interp(share_at_least_cost(cost, lattice, heights, core), SHARES, (1.0, LEAST_FACTOR)))
 
 
-def smaller_penalties(penalties: NDArray[np.uint16], share: float, least_penalty: float) -> NDArray[np.uint16]:
-    """Penalties of jumps (4, r, c) for a share of cells, see `share_at_least_cost`; those above `least_penalty`, that
-    of a strong edge of the ortho-image, do not fall below it."""
-    factor = np.float32(np.interp(share, SHARES, (1.0, LEAST_FACTOR)))
+def smaller_penalties(penalties: NDArray[np.uint16], factor: float, least_penalty: float) -> NDArray[np.uint16]:
+    """Penalties of jumps (4, r, c) times a factor; those above `least_penalty`, that of a strong edge of the
+    ortho-image, do not fall below it."""
     least = np.minimum(penalties, np.uint16(least_penalty))
-    return np.maximum((penalties * factor).astype(np.uint16), least)
+    return np.maximum((penalties * np.float32(factor)).astype(np.uint16), least)
 
 
 def penalties_after_misfit(penalties: NDArray[np.uint16], of_patch: NDArray[np.float32]) -> NDArray[np.uint16]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ LEAST_P1 = 45
 # The default of P1 for two images is that of height steps of so many cells, or more: those of satellite images. The
 # least P1 of many images holds for steps of a cell or more.
 USUAL_STEP_CELLS, LEAST_STEP_CELLS = 1.35, 1.0
+# The uniqueness of a height without another minimum, as the kernel `winners` writes it.
+NO_OTHER_HEIGHT = 65535
 # Cells that only two images cover ask for so many times the contrast of an edge that opens a jump.
 PAIR_CONTRAST = np.float32(4.0)
 
@@ -48,6 +50,17 @@ class SemiGlobalHeights:
         """
         best, second = (level_indices(index, slope_cells) for index in (self.best, self.second))
         return SemiGlobalHeights(best, second, self.uniqueness, self.vertex + slope_cells)
+
+    def with_full_penalties(self, factor: float) -> SemiGlobalHeights:
+        """The same heights with the uniqueness as it would be with penalties that were not made smaller by a factor.
+
+        Limits of the uniqueness, and the precision model, count it in units of the full penalties.
+        """
+        if factor == 1.0:
+            return self
+        in_full = np.minimum(self.uniqueness / np.float32(factor), np.float32(NO_OTHER_HEIGHT - 1))
+        is_only = self.uniqueness == NO_OTHER_HEIGHT
+        return replace(self, uniqueness=np.where(is_only, NO_OTHER_HEIGHT, in_full).astype(np.uint16))
 
 
 def level_indices(index: NDArray[np.int32], slope_cells: NDArray[np.float32]) -> NDArray[np.int32]:

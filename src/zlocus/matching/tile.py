@@ -57,12 +57,14 @@ from zlocus.matching.prior_costs import (
     costs_of_coarser,
     misfit,
     penalties_after_misfit,
-    penalties_of_agreement,
+    penalty_factor,
+    smaller_penalties,
 )
 from zlocus.matching.search_range import coarsest_prior, prior_from_coarser, reachable_range, table_range
 from zlocus.matching.semiglobal import (
     SemiGlobalHeights,
     aggregate,
+    least_jump_penalty,
     level_indices,
     winner_takes_all_heights,
     winner_takes_all_indices,
@@ -327,15 +329,9 @@ def level_costs(
             search.lattice, search.slope_surface, level, prior.coarser_result, config.pyramid
         )  # fmt: skip
     cost = cost_volume(
-        search.slope_views,
-        search.slope_surface,
-        search.lattice,
-        chosen.matched,
-        config.cost,
-        CountedPairs.of(tile),
-        taught_heights,
-        known_costs,
-    )
+        search.slope_views, search.slope_surface, search.lattice, chosen.matched, config.cost, CountedPairs.of(tile),
+        taught_heights, known_costs,
+    )  # fmt: skip
     if tile.method != "mvll" and prior.coarser_result is None:
         add_costs_beyond_expected(cost, search.lattice, search.slope_surface, tile.match_scene, level)
     alike = view_agreement(tile, level, search, covers(visible), prior)
@@ -454,19 +450,18 @@ def semiglobal_heights(
     heights = aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
     if search.smooth is None:
         return heights
-    if is_evidence:
-        penalties = penalties_of_agreement(penalties, cost, search.lattice, heights, level, options)
+    factor = penalty_factor(cost, search.lattice, heights, level.core, options) if is_evidence else 1.0
     has_rays = add_costs_of_rays(
         cost, search.tile_views, search.slope_surface, search.lattice, visible, heights.vertex, level.number, step_cells
     )
     if is_evidence:
-        of_patch = misfit(cost, search.lattice, heights)
-        penalties = penalties_after_misfit(penalties, of_patch)
+        penalties = smaller_penalties(penalties, factor, least_jump_penalty(level.number, options))
+        penalties = penalties_after_misfit(penalties, misfit(cost, search.lattice, heights))
         add_costs_far_from_surface(cost, search.lattice, search.slope_surface, heights, level.number, step_cells)
     elif not has_rays:
         return heights
     penalties = constrain(lines, level, search.lattice, search.slope_surface, cost, penalties)
-    return aggregate(cost, search.lattice, penalties, step_cells, options, n_images)
+    return aggregate(cost, search.lattice, penalties, step_cells, options, n_images).with_full_penalties(factor)
 
 
 def _level_result(
