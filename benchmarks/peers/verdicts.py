@@ -7,6 +7,8 @@ import statistics
 from collections.abc import Iterator
 from typing import Any
 
+from peers.frames import FRAME
+
 OWN = "zlocus"
 # Figures that decide a scene: of all cells, with the sign of a good figure (1: low, -1: high).
 DECIDING = {"within": -1.0, "rmse": 1.0, "nmad": 1.0}
@@ -22,6 +24,11 @@ REASONS = {
     "building": "roofs without texture take the height that noise gives them",
     "ground": "the search range is wide, so that noise finds false heights far away",
 }
+# The same on scenes of frame cameras, whose pixels are smaller than the cells that all programs are asked for.
+SMALL_PIXELS = (
+    "windows of the asked cells smooth away what smaller pixels show; in cells as large as a pixel more are found"
+)
+FRAME_REASONS = REASONS | {"tree": SMALL_PIXELS, "building": SMALL_PIXELS}
 PLURALS = {"road": "roads", "tree": "trees", "field": "fields", "building": "roofs", "ground": "ground"}
 GROSS = "gross errors of cells that no two images see, at heights where the images agree on what lies elsewhere"
 SEED_SCENE = re.compile(r"^realistic \d+, (\d) views$")
@@ -138,13 +145,14 @@ def lost_classes(rows: dict[str, dict[str, Any]]) -> list[tuple[str, str, float,
     return sorted(found, key=lambda loss: loss[3] - loss[2])
 
 
-def why(rows: dict[str, dict[str, Any]]) -> str:
-    """Where zlocus loses on a scene, and why, as a sentence; empty where it loses nothing."""
+def why(rows: dict[str, dict[str, Any]], scene_kind: str | None = None) -> str:
+    """Where zlocus loses on a scene, and why, as a sentence; empty where it loses nothing. scene_kind : of `Scene`."""
     losses, classes = lost(rows), lost_classes(rows)
+    reasons = FRAME_REASONS if scene_kind == FRAME else REASONS
     if not losses:
         return ""
     parts = [
-        f"{PLURALS[kind]} {own:.3f}, {program} {other:.3f} ({REASONS[kind]})" for kind, program, other, own in classes
+        f"{PLURALS[kind]} {own:.3f}, {program} {other:.3f} ({reasons[kind]})" for kind, program, other, own in classes
     ]
     if "rmse" in losses and losses["rmse"][2] > 1.2 * losses["rmse"][1]:
         parts.append(GROSS)
@@ -167,4 +175,4 @@ def verdict_lines(found: dict[str, Any]) -> Iterator[list[str]]:
                 cells.append(f"{first[0]} {form(first[1])}" + (f", {others[0]} {form(others[1])}" if others else ""))
             else:
                 cells.append(f"**{first[0]} {form(first[1])}**, {OWN} {form(own)}")
-        yield [*cells, why(rows)]
+        yield [*cells, why(rows, found["scenes"].get(scene, {}).get("kind"))]

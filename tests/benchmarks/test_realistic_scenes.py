@@ -17,7 +17,16 @@ from marked_cells import MarkedErrors, marked_errors
 from pages import scene_tables
 from peers import realistic as peer_scenes
 from peers.results import Results as PeerResults
-from peers.verdicts import MEAN_SCENE, lost_classes, severity, verdict_lines, with_means_of_seeds
+from peers.verdicts import (
+    MEAN_SCENE,
+    REASONS,
+    SMALL_PIXELS,
+    lost_classes,
+    severity,
+    verdict_lines,
+    why,
+    with_means_of_seeds,
+)
 from result_files import Results
 from rows import clouds as cloud_rows
 from rows import troubles as trouble_rows
@@ -193,6 +202,15 @@ def test_the_heaviest_loss_comes_first_with_its_reason(found):
     rows = {r["program"]: r for r in found["surfaces"] if r["scene"] == "lost"}
     assert severity(rows) == pytest.approx(2.0)
     assert lost_classes(rows) == [("road", "CARS", 0.8, 0.2)]
+
+
+def test_frames_have_a_reason_of_their_own():
+    def row(of_all, of_roofs):
+        return {"classes": {"all": {"n": 9, "within": of_all}, "building": {"n": 9, "within": of_roofs}}}
+
+    rows = {"zlocus": row(0.6, 0.5), "CARS": row(0.8, 0.7)}
+    assert why(rows, "frames") == f"roofs 0.500, CARS 0.700 ({SMALL_PIXELS})"
+    assert why(rows, "city") == f"roofs 0.500, CARS 0.700 ({REASONS['building']})"
 
 
 def test_how_hard_the_recipe_is_for_others(found, tmp_path, monkeypatch):
