@@ -52,6 +52,7 @@ DEPARTURES = {
     "free rays": Departure(patches={"zlocus.matching.tile.add_costs_of_rays": False}),
     "two predecessors of each path": Departure({"semiglobal": {"predecessors": 1}}),
     "cheap jumps at edges": Departure({"semiglobal": {"p2_edge": 400}}),
+    "cheaper jumps where the costs agree": Departure({"semiglobal": {"p2": 400}}),
     "planes through plain segments": Departure({"planes": {"texture": 0.0}}),
     "smoothing by planes": Departure({"refine": {"max_plane_side": 0}}),
     "medians of uncertain heights": Departure({"refine": {"median_sigma_steps": 1e6}}),
