@@ -46,8 +46,8 @@ LOW, HIGH = 4.0, 28.0  # steps: a tower of 12 m
 TOWER = np.s_[14:26, 24:36]
 RIM = 1  # cells beside an edge that other views may show, for its place is not known better
 GREY = 2.0
-# Of a town, as benchmarks/acceptance.py has it; 0.0038 of the ground and 0.0024 of the roofs of this part, and 0.0145 of
-# the ground where nothing hides.
+# Of a town, as benchmarks/acceptance.py has it; 0.0038 of the ground and 0.0024 of the roofs of this part, and 0.0145
+# of the ground where nothing hides.
 MOST_HIDDEN = 0.005
 PART_OF_TOWN = (500170, 5205710, 500370, 5205910)
 
