@@ -35,7 +35,8 @@ class SemiGlobalHeights:
 
     best : int32, minimum of the sums of path costs; second : int32, the secondary minimum, that is the least local
     minimum at least three steps away, = best where there is none; uniqueness : uint16, by how much the sum at `second`
-    is larger, 65535 where there is none; vertex : float32, minimum of the parabola through the sums around `best`.
+    is larger, 65535 where there is none, see `with_full_penalties`; vertex : float32, minimum of the parabola through
+    the sums around `best`.
     """
 
     best: NDArray[np.int32]
